@@ -135,5 +135,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the names that are there, those that are not loaded as well."""
-    return sorted({*globals(), *_MODULES, '__version__'})
+    """Return what the package gives, loaded or not, without what it is made of."""
+    return [*__all__, '__version__', '__doc__', '__name__', '__path__']

@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
@@ -27,6 +28,35 @@ NODES = (
     'screen',
 )
 """The nodes, which set a handler of SIGINT of their own once they have loaded."""
+STARTED_BY = 'ADXL_ROS_COMMAND'
+"""Environment variable with the words before the name of a tool, as its user wrote them."""
+ONE_COMMAND = 'adxl_ros'  # The command of a package that pip has installed
+NAMES_OPTIONS = 'ADXL_ROS_NAMES_OPTIONS'
+"""Environment variable of tools and nodes, and of their workers: texts name options of tools."""
+_OPTIONS = {
+    'certificate': 'dcc',
+    'effects': 'effect',
+    'quantity': 'in',
+    'sensor': 'params',
+}
+"""Options of tools that are not called as the argument of a verb, by that argument."""
+_UNQUOTED = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?|[A-Z]{2,}')
+"""What has no quotes in Python: numbers, and words in capitals, which stand for values."""
+_METHODS = ('certificate', 'report')  # Options of `fit` that are methods of its result in Python
+READING = (
+    'topic',
+    'columns',
+    'unit',
+    'lsb_per_g',
+    'lsb_at_0g',
+    'rate',
+    'axes',
+    'drop_bad_stamps',
+    'drop_bad_samples',
+)
+"""Arguments of `read`, which are options of the tools that read recordings."""
+_READER = ContextVar('reader', default='read or from_arrays')
+"""What reads recordings, as texts in Python call it."""
 
 
 def release_version() -> str:
@@ -57,13 +87,6 @@ def code_version() -> str:
     return hashlib.sha256(release_version().encode() + b''.join(code)).hexdigest()
 
 
-STARTED_BY = 'ADXL_ROS_COMMAND'
-"""Environment variable with the words before the name of a tool, as its user wrote them."""
-
-
-ONE_COMMAND = 'adxl_ros'  # The command of a package that pip has installed
-
-
 def program(tool: str) -> str:
     """Return how messages call a tool: with the one command, where it was started by that."""
     started_by = os.environ.get(STARTED_BY, '')
@@ -76,30 +99,14 @@ def command(tool: str, arguments: str = '') -> str:
     return f'{os.environ.get(STARTED_BY, usual)} {tool} {arguments}'.rstrip()
 
 
-NAMES_OPTIONS = 'ADXL_ROS_NAMES_OPTIONS'
-"""Environment variable of tools and nodes, and of their workers: texts name options of tools."""
-_OPTIONS = {
-    'certificate': 'dcc',
-    'effects': 'effect',
-    'quantity': 'in',
-    'sensor': 'params',
-}
-"""Options of tools that are not called as the argument of a verb, by that argument."""
-_UNQUOTED = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?|[A-Z]{2,}')
-"""What has no quotes in Python: numbers, and words in capitals, which stand for values."""
-_METHODS = ('certificate', 'report')  # Options of `fit` that are methods of its result in Python
-READING = (
-    'topic',
-    'columns',
-    'unit',
-    'lsb_per_g',
-    'lsb_at_0g',
-    'rate',
-    'axes',
-    'drop_bad_stamps',
-    'drop_bad_samples',
-)
-"""Arguments of `read`, which are options of the tools that read recordings."""
+@contextmanager
+def read_by(verb: str) -> Iterator[None]:
+    """Let texts name the verb that reads a recording; others do not know it."""
+    token = _READER.set(verb)
+    try:
+        yield
+    finally:
+        _READER.reset(token)
 
 
 @contextmanager
@@ -132,7 +139,7 @@ def option(*names: str, **values: Any) -> str:
         return ' '.join(_of_tool(name, value) for name, value in given.items())
     arguments = _arguments(given)
     # Other verbs take recordings as they were read.
-    return f'read(..., {arguments})' if given.keys() <= {*READING} else arguments
+    return f'{_READER.get()}(..., {arguments})' if given.keys() <= {*READING} else arguments
 
 
 def usage(verb: str, *inputs: str, **values: Any) -> str:

@@ -13,7 +13,7 @@ import asyncio
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 import logging
 from multiprocessing import get_context, parent_process
@@ -23,7 +23,7 @@ import os
 from queue import Empty, SimpleQueue
 import signal
 import sys
-from threading import local, Thread
+from threading import local, Lock, Thread
 from typing import Any, cast, NamedTuple
 from uuid import uuid4
 import warnings
@@ -44,6 +44,14 @@ network within some."""
 _FETCH_S = 60.0
 """Time in which a cluster must deliver a result, s: a page of 3 MB over 0.4 Mbit/s takes as
 long."""
+_LOGGERS_OF_DASK = (
+    'distributed',
+    'distributed.client',
+    'distributed.utils',
+    'tornado.application',
+)
+_THREADS = 'OPENBLAS_NUM_THREADS'  # Variable that a new process reads before it loads numpy
+_STARTS = Lock()  # Held while the environment is that of a new process
 _DIED = 'the worker ended while it ran the task'
 _WAIT_S = 1.0
 """Time after which the number of slots is asked for again, s: a cluster starts workers over
@@ -54,15 +62,22 @@ class WorkerDied(Exception):
     """The worker ended while it ran a task."""
 
 
+class End(NamedTuple):
+    """How an attempt at a task ended."""
+
+    value: Any  # What it returned; None after an error
+    error: BaseException | None = None  # What it raised; None after a success
+
+
 class Pool(Executor):
     """Workers, and how many tasks are submitted to them at once."""
 
     slots: int
 
-    def end(self, future: Any) -> tuple[Any, BaseException | None]:
-        """Return what a task that ended returned, and what it raised."""
+    def end(self, future: Any) -> End:
+        """Return how a task ended."""
         error = future.exception()
-        return (None, error) if error else (future.result(), None)
+        return End(None, error) if error else End(future.result())
 
     def kill(self) -> None:
         """End all workers at once."""
@@ -77,23 +92,58 @@ def open_pool(
 
     Its workers end with the block, at once if an exception ends it.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
-    pool = Cluster(scheduler, shared) if scheduler else Processes(jobs or cores or 1, shared)
-    try:
-        yield pool
-    except BaseException:
-        pool.kill()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with _without_messages_of_dask() if scheduler else nullcontext():
+        pool = Cluster(scheduler, shared) if scheduler else Processes(jobs or _cores(), shared)
+        try:
+            yield pool
+        except BaseException:
+            pool.kill()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def _without_messages_of_dask() -> Iterator[None]:
+    """Silence Dask for a while: a lost scheduler is reported by this module, in one line."""
+    loggers = list(map(logging.getLogger, _LOGGERS_OF_DASK))
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        warnings.filterwarnings('ignore', 'Sending large graph')
+        try:
+            for logger in loggers:
+                logger.setLevel(logging.CRITICAL)
+            yield
+        finally:
+            for logger, level in zip(loggers, levels):
+                logger.setLevel(level)
+
+
+@contextmanager
+def _environment_of_worker() -> Iterator[None]:
+    """Let processes that start meanwhile use one core each."""
+    with _STARTS:
+        before = os.environ.get(_THREADS)
+        os.environ[_THREADS] = '1'
+        try:
+            yield
+        finally:
+            del os.environ[_THREADS]
+            if before is not None:
+                os.environ[_THREADS] = before
 
 
 class Processes(Pool):
-    """Processes of this machine, each with a thread and a pipe of its own: no lock is shared."""
+    """Processes of this machine, each with a thread and a pipe of its own."""
 
     def __init__(self, count: int, shared: tuple = ()) -> None:
-        # A new process reads this before it loads numpy; each uses one core.
-        os.environ['OPENBLAS_NUM_THREADS'] = '1'
         self.slots = _TASKS_PER_WORKER * count
         self._shared = shared
         self._is_killed = False
@@ -112,20 +162,21 @@ class Processes(Pool):
             if getattr(own, 'pipe', None) is None or not own.process.is_alive():
                 own.process, own.pipe = self._start()
             own.pipe.send(task)
-            value, error = own.pipe.recv()
+            end: End = own.pipe.recv()
         except (EOFError, OSError):
             own.pipe = None
             raise WorkerDied(_DIED) from None
-        if error is not None:
-            raise error
-        return value
+        if end.error is not None:
+            raise end.error
+        return end.value
 
     def _start(self) -> tuple[Any, Connection]:
         """Start a process; the only other end of its pipe is in it, so that its end shows."""
         context = get_context('spawn')
         pipe, other = context.Pipe()
         process = context.Process(target=_work, args=(other, self._shared))
-        process.start()
+        with _environment_of_worker():
+            process.start()
         other.close()
         self._processes.append(process)
         if self._is_killed:
@@ -170,9 +221,9 @@ def _work(pipe: Connection, shared: tuple) -> None:
         while True:
             work, arguments = pipe.recv()
             try:
-                pipe.send((work(*shared, *arguments), None))
+                pipe.send(End(work(*shared, *arguments)))
             except Exception as error:
-                pipe.send((None, ExceptionWithTraceback(error, error.__traceback__)))
+                pipe.send(End(None, ExceptionWithTraceback(error, error.__traceback__)))
     except (SystemExit, EOFError, ConnectionError):
         # Threads of a task do not keep the process.
         os._exit(0)
@@ -186,15 +237,6 @@ class Cluster(Pool):
             import distributed
         except ImportError:
             raise UserError(f'--scheduler needs Dask; {install_hint("distributed")}') from None
-        # A lost scheduler is reported by this module, in one line.
-        for name in (
-            'distributed',
-            'distributed.client',
-            'distributed.utils',
-            'tornado.application',
-        ):
-            logging.getLogger(name).setLevel(logging.CRITICAL)
-        warnings.filterwarnings('ignore', 'Sending large graph')
         self._address = address
         self._slots = _FEWEST_TASKS
         try:
@@ -227,16 +269,18 @@ class Cluster(Pool):
         except (OSError, RuntimeError, ClosedClientError):
             raise self._lost() from None
 
-    def end(self, future: Any) -> tuple[Any, BaseException | None]:
-        """Return what a task returned and raised."""
+    def end(self, future: Any) -> End:
+        """Return how a task ended."""
         from distributed.scheduler import KilledWorker
 
         try:
-            return future.result(timeout=_FETCH_S), None
+            return End(future.result(timeout=_FETCH_S))
+        except KilledWorker:
+            return End(None, WorkerDied(_DIED))
         except (Exception, asyncio.CancelledError) as error:
             if getattr(future, 'status', 'error') != 'error':
                 raise self._lost() from None
-            return None, WorkerDied(_DIED) if isinstance(error, KilledWorker) else error
+            return End(None, error)
 
     def _lost(self) -> UserError:
         return UserError(
@@ -248,6 +292,13 @@ class Cluster(Pool):
         """Leave the cluster, which runs on; tasks are given up."""
         with suppress(Exception):
             self._client.close(timeout=_WAIT_S)
+
+
+class _Task(NamedTuple):
+    """A task that is to run."""
+
+    arguments: tuple
+    attempt: int = 1  # Number of the next attempt
 
 
 class Finished(NamedTuple):
@@ -268,29 +319,33 @@ def finished_tasks(
     A task that raises, or whose worker ends, is repeated after all others. A `UserError` is not:
     it would come again.
     """
-    todo = ((arguments, 1) for arguments in tasks)
-    again: deque[tuple[tuple, int]] = deque()
-    running: dict[Any, tuple[tuple, int]] = {}
+    todo = map(_Task, tasks)
+    again: deque[_Task] = deque()  # Failed tasks
+    running: dict[Any, _Task] = {}
     ended: SimpleQueue[Any] = SimpleQueue()
     try:
         while True:
             slots = pool.slots
-            while len(running) < slots and (
-                item := next(todo, None) or (again.popleft() if again else None)
-            ):
-                future = pool.submit(work, *item[0])
-                running[future] = item
+            while len(running) < slots:
+                task = next(todo, None)
+                if task is None and again:
+                    task = again.popleft()
+                if task is None:
+                    break
+                future = pool.submit(work, *task.arguments)
+                running[future] = task
                 future.add_done_callback(ended.put)
             if not running:
                 return
             with suppress(Empty):
                 future = ended.get(timeout=_WAIT_S)
-                arguments, attempt = running.pop(future)
+                task = running.pop(future)
                 value, error = pool.end(future)
-                if error is None or isinstance(error, UserError) or attempt > retries:
-                    yield Finished(arguments, value, error, attempt)
+                is_final = error is None or isinstance(error, UserError)
+                if is_final or task.attempt > retries:
+                    yield Finished(task.arguments, value, error, task.attempt)
                 else:
-                    again.append((arguments, attempt + 1))
+                    again.append(task._replace(attempt=task.attempt + 1))
     finally:
         for future in running:
             with suppress(Exception):  # of a scheduler that is gone

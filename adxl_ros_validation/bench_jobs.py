@@ -27,7 +27,8 @@ from typing import Any
 from adxl_ros.calibrate.fits.gravity_fit import fit_gravity
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import wire_format
 from adxl_ros.model import sensor as sensors, signal_chain
 from adxl_ros.model.constants import G0_MPS2

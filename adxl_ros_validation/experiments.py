@@ -15,7 +15,8 @@ from adxl_ros.calibrate.pose_model import stage_force
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.recorded_poses import estimate_filters, extract_poses
 from adxl_ros.compensate import inversions
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -24,7 +25,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components
 from adxl_ros.model.kinematics import tilt
 from adxl_ros.model.sensor import get, Sensor, typical, with_neutral
-from adxl_ros.signals import recorded_sensor
+from adxl_ros.signals import filter_noise
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import simulate
@@ -307,7 +308,7 @@ def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) 
     fitted = {name: MODELS[name](nominal, poses) for name in models}
     if 'full' in fitted:
         noise = estimate_filters(recording, nominal, poses)
-        fitted['full'], _ = recorded_sensor.with_filter(fitted['full'], [noise])
+        fitted['full'], _ = filter_noise.with_filter(fitted['full'], [noise])
     return Run(truth, fitted, poses, true)
 
 

@@ -204,6 +204,8 @@ RESULTS = (
     'adxl_ros.api.noise:Noise',
     'adxl_ros.api.result:FirstScreen',
     'adxl_ros.report.screen:NextStep',
+    'adxl_ros.api.sensors:HasSensor',
+    'adxl_ros.simulate.motion:Motion',
 )
 """What the verbs take and return; the types of their fields follow each."""
 READ_FIRST = (
@@ -639,8 +641,10 @@ def documented_classes() -> Iterator[str]:
         'a link](../howto/own_link.md) use them; these paths stay.',
         '',
     ]
-    for path in LIBRARY:
-        yield from described(path, 3)
+    shown = with_fields(RESULTS)
+    for path in with_fields(LIBRARY):
+        if path not in shown:
+            yield from described(path, 3)
 
 
 def with_fields(paths: Iterable[str]) -> list[str]:
@@ -696,7 +700,7 @@ def verb(name: str) -> Iterator[str]:
 
 def signature(item: Any) -> str:
     """Return the parameters of a callable, without the quotes of annotations."""
-    text = re.sub(r'<function \S+ at 0x\w+>', '...', str(inspect.signature(item)))
+    text = re.sub(r'<function (\S+) at 0x\w+>', r'\1', str(inspect.signature(item)))
     text = re.sub(r"(: |-> )'([^']*)'", r'\1\2', text)
     return '\n'.join(
         textwrap.wrap(

@@ -29,7 +29,8 @@ from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_word
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import make_folder, require_own
-from adxl_ros.files.recording_columns import nominal_of, recorded_nominal, Recording
+from adxl_ros.files.recording_columns import recorded_nominal, Recording
+from adxl_ros.files.stream_info import nominal_of
 from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -42,8 +43,6 @@ from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, measured_lines
 
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
-
-
 _MEANS_LACK = (
     'a table of means shows no noise, filter or range: they are measured from the '
     'first recording that the file corrects'

@@ -10,8 +10,7 @@ from functools import partial
 from itertools import chain
 import os
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.api.recordings import (
     as_series,
@@ -20,7 +19,14 @@ from adxl_ros.api.recordings import (
     RecordingInput,
     RobotInput,
 )
-from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
+from adxl_ros.api.result import (
+    as_json,
+    FirstScreen,
+    no_progress,
+    Progress,
+    require_number,
+    Result,
+)
 from adxl_ros.api.sensors import as_input, sensor_of, SensorInput
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
@@ -30,9 +36,10 @@ from adxl_ros.files import recording as recording_files
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.screen import Tile
 from adxl_ros.signals import findings_report as words
-from adxl_ros.signals.findings import Ability, check_recording, Findings
+from adxl_ros.signals.findings import Ability, check_recording, Findings, Shown
 from adxl_ros.signals.gate import (
     Earlier,
     KINDS,
@@ -42,7 +49,10 @@ from adxl_ros.signals.gate import (
     require_kinds,
     write_junit,
 )
+from adxl_ros.simulate.motion import Motion
 
+_FIGURES = ['samples', 'span_s', 'rate_hz', 'missing', 'rest_share', 'rests', 'poses']
+"""Numbers of a recording in the table of a check."""
 _MOST_SHOWN = 1_000_000
 """Samples up to which it is listed what `diagnose` could show. Chosen: a minute, and 1 GB."""
 
@@ -143,16 +153,12 @@ class Check(Result):
         return path
 
 
-_FIGURES = ['samples', 'span_s', 'rate_hz', 'missing', 'rest_share', 'rests', 'poses']
-"""Numbers of a recording in the table of a check."""
-
-
 def check(
     recordings: RecordingInput | Iterable[RecordingInput],
     sensor: SensorInput | None = None,
     *,
     against: RecordingInput | None = None,
-    minima: Mapping[str, float] = MappingProxyType({}),
+    minima: Mapping[str, float] | None = None,
     urdf: str | os.PathLike | None = None,
     frame: str = 'imu_link',
     joints: str = '',
@@ -193,43 +199,57 @@ def check(
         The parameter file of the sensor cannot be read.
 
     """
+    minima = minima or {}
     if unknown := sorted(set(minima) - set(MINIMA)):
         raise UserError(f'minima: {unknown[0]!r} is none of {", ".join(MINIMA)}')
-    several = list(map(_stored, as_series(recordings)))
+    for name, smallest in minima.items():
+        require_number(f'minima, {name}', smallest)
     options = reading_options(**{**reading, 'drop_bad_stamps': True})
-    stated = as_input(sensor)
-    earlier = None
-    compared_with = ''
     robot = RobotInput(urdf, frame, joints) if urdf else None
-    if against is not None:
-        before = _stored(against)
-        found = check_recording(before, stated, options)
-        samples = _samples(before, options)
-        earlier = Earlier(found, samples, stated)
-        faults = found.faults
-        if robot:
-            try:
-                robot.path(samples, sensor_of(sensor, samples).sensor)
-            except UserError as error:
-                faults = (*faults, one_line(error))
-        compared_with = _path(before)
-        if faults:
-            compared_with += f', not sound: {faults[0]}'
+    several = list(map(_stored, as_series(recordings)))
+    earlier = None if against is None else _earlier(_stored(against), sensor, robot, options)
     results = []
+    outcomes = []
     for number, each in enumerate(several):
         name = Path(_path(each)).name
 
         def step(done: float, number: int = number, name: str = name) -> None:
             progress((number + done) / len(several), name)
 
-        results.append(check_recording(each, stated, options, step))
-    if len(results) == 1:
-        results = [_with_what_shows(results[0], several[0], sensor, robot, options)]
-    outcomes = [
-        outcomes_of(result, minima, earlier, partial(_samples, each, options))
-        for result, each in zip(results, several)
-    ]
-    return Check(tuple(results), tuple(outcomes), compared_with)
+        result = check_recording(each, as_input(sensor), options, step)
+        if len(several) == 1:
+            result = _with_what_shows(result, each, sensor, robot, options)
+        read = partial(_samples, each, options)
+        results.append(result)
+        outcomes.append(outcomes_of(result, minima, earlier and earlier.recording, read))
+    return Check(tuple(results), tuple(outcomes), earlier.name if earlier else '')
+
+
+class _Against(NamedTuple):
+    """What recordings are compared with."""
+
+    recording: Earlier
+    name: str  # Its name, with its first fault if it has one
+
+
+def _earlier(
+    given: Recording | str,
+    sensor: SensorInput | None,
+    robot: RobotInput | None,
+    reading: ReadingOptions,
+) -> _Against:
+    """Look at an earlier recording, which others are compared with."""
+    found = check_recording(given, as_input(sensor), reading)
+    read = _samples(given, reading)
+    recording = Earlier(found, read, as_input(sensor))
+    faults = [*found.faults]
+    if robot:
+        try:
+            robot.path(read, sensor_of(sensor, read).sensor)
+        except UserError as error:
+            faults.append(one_line(error))
+    unsound = f', not sound: {faults[0]}' if faults else ''
+    return _Against(recording, _path(given) + unsound)
 
 
 def _stored(given: RecordingInput) -> Recording | str:
@@ -258,37 +278,49 @@ def _with_what_shows(
 ) -> Findings:
     """Add which effects `diagnose` could show in a recording, and from which size."""
     can_diagnose = any(each.tool == 'diagnose' and each.is_able for each in result.abilities)
-    if not result.is_sound or not (robot or can_diagnose):
+    has_reference = can_diagnose or robot is not None
+    if not result.is_sound or not has_reference:
         return result
+    remarks = [*result.remarks]
     if result.contents is None or result.contents.samples > _MOST_SHOWN:
-        remark = (
+        remarks.append(
             'what diagnose could show is listed for recordings of '
             f'{_MOST_SHOWN} samples at most; check a part'
         )
-        return replace(result, remarks=(*result.remarks, remark))
+        return replace(result, remarks=tuple(remarks))
+    faults = []
+    shows: list[Shown] = []
     reason = 'against the joints of the robot'
-    sim = None
     try:
         read = _samples(given, reading)
         unit = sensor_of(sensor, read).sensor
+        sim = None
         if robot:
             path = robot.path(read, unit)
-            result = replace(result, remarks=(*result.remarks, path.text()))
+            remarks.append(path.text())
             sim = path.as_motion()
-        could_show = what_shows([read], unit, sim)
-        if isinstance(could_show, DataFault):
-            reason = could_show.message
-        else:
-            scale_v_per_g = float(unit.scale_v_per_g.mean())
-            shown_first = sorted(could_show, key=lambda effect: not effect.shows)
-            rows = [as_shown(effect, scale_v_per_g) for effect in shown_first]
-            result = replace(result, shows=tuple(rows))
+        shows = _shows(read, unit, sim)
+    except DataFault as fault:
+        reason = fault.message
     except UserError as error:
         reason = one_line(error)
         if robot:
-            result = replace(result, faults=(*result.faults, reason))
-    if robot or not result.shows:
-        ability = Ability('diagnose', bool(result.shows), reason)
-        abilities = {each.tool: each for each in result.abilities} | {ability.tool: ability}
-        result = replace(result, abilities=tuple(abilities.values()))
-    return result
+            faults.append(reason)
+    abilities = {each.tool: each for each in result.abilities}
+    if robot or not shows:
+        abilities['diagnose'] = Ability('diagnose', bool(shows), reason)
+    return replace(
+        result,
+        faults=tuple(faults),
+        remarks=tuple(remarks),
+        abilities=tuple(abilities.values()),
+        shows=tuple(shows),
+    )
+
+
+def _shows(read: Recording, unit: Sensor, sim: Motion | None) -> list[Shown]:
+    """Return by effect what `diagnose` could show, those that it could first; or raise a fault."""
+    could_show = what_shows([read], unit, sim)
+    scale_v_per_g = float(unit.scale_v_per_g.mean())
+    shown_first = sorted(could_show, key=lambda effect: not effect.shows)
+    return [as_shown(effect, scale_v_per_g) for effect in shown_first]

@@ -21,7 +21,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import require_own
 from adxl_ros.files.bag_writer import angular_velocity, tilt_bag
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import check_same_sensor, GYRO, Recording
+from adxl_ros.files.recording_columns import GYRO, Recording
+from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import base, effect_named

@@ -5,14 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 import os
 from pathlib import Path
-import shlex
 from typing import Any, NamedTuple
 
+from adxl_ros.api.compared import Compared, PARAMETERS
 from adxl_ros.api.recordings import (
     each_recording,
     one_recording,
@@ -39,13 +38,12 @@ from adxl_ros.diagnose.screen import screen_lines
 from adxl_ros.diagnose.self_check import diagnose_again
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import free_name, make_folder, require_own, write_text
-from adxl_ros.files.recording_columns import NO_SERIAL, Recording
+from adxl_ros.files.atomic_write import make_folder, require_own, write_text
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.files.surroundings import assumed
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import command, option
+from adxl_ros.process import option
 from adxl_ros.report.figures import AFTER_COLOUR, axes_for, BEFORE_COLOUR, QUIET_COLOUR
 from adxl_ros.report.quantities import Interval, mg
 from adxl_ros.report.screen import NextStep
@@ -53,7 +51,6 @@ from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.recorded_motion import motion_from_force
 
 PAGE = 'report.html'  # File of the page of a diagnosis
-PARAMETERS = 'params.yaml'  # File of the sensor with the effects that were found
 REPORT = 'report.json'  # File of the figures
 _NO_VERDICT = ('bad_data', 'insufficient')
 """Outcomes without a verdict: a fault of a recording, or too little in it."""
@@ -89,19 +86,6 @@ class GapFigures(NamedTuple):
     upper_limit_mps2: float  # A gap of any kind above it would have shown, m/s²
     material_mps2: float  # Smaller amplitudes are no gap, rms, m/s²
     reference_mps2: float  # Error of the reference that returns with each pose, rms, m/s²
-
-
-class Compared(NamedTuple):
-    """What was compared with what, for the page and for commands."""
-
-    recordings: tuple[str, ...]  # Names or paths of the recordings
-    params: str  # What names the sensor on a command line; '' for the nominal one
-    params_name: str  # Name of its file
-    sim: str  # Path of the recording of another simulator; '' for none
-    sim_unit: str  # Unit of that, as it was given; '' for m/s²
-    urdf: str  # Path of the robot; '' for none
-    frame: str  # Its frame that carries the sensor
-    subject: str  # All of it in one line
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -143,11 +127,6 @@ class Gap(Result):
     """What was compared with what."""
     diagnosis: Diagnosis
     """All steps between the recordings and the verdict."""
-
-    def with_params(self, path: str) -> Gap:
-        """Name the parameter file of a sensor that was given as such; '' is the usual one."""
-        name = Path(path).name or self.compared.params_name
-        return replace(self, compared=self.compared._replace(params=path, params_name=name))
 
     @property
     def fault_name(self) -> str:
@@ -254,92 +233,16 @@ class Gap(Result):
             subject=self.compared.subject,
             parameter_file=self.compared.params_name,
             steps=self.next_steps(folder),
-            command=made_by or self.command(folder),
+            command=made_by or self.compared.command(folder),
         )
         return page.documents(
             self.diagnosis, self.to_dict(), self.screen, run if has_page else None
         )
 
-    def command(self, folder: str | os.PathLike) -> str:
-        """
-        Return the command line that repeats the diagnosis into a folder.
-
-        RECORDING and SIMULATION stand for samples that are in no file yet.
-        """
-        given = {
-            '--params': self.compared.params,
-            '--sim': _stored(self.compared.sim, 'SIMULATION'),
-            '--sim-unit': self.compared.sim_unit,
-            '--urdf': self.compared.urdf,
-            '--frame': self._frame,
-            '-o': str(folder),
-        }
-        return _command(self._stored_recordings, given)
-
     def next_steps(self, folder: str | os.PathLike) -> list[NextStep]:
         """Return what to record, how to diagnose that, and how to simulate what was found."""
-        report = self.diagnosis.report
-        compared = self.compared
-        if report is None:
-            return []
-        params = str(Path(folder) / PARAMETERS)
-        proposal = report.next_experiment
-        steps = []
-        if proposal is not None:
-            both = f', and {proposal.stem}_simulated.csv in the simulator' if compared.sim else ''
-            steps.append(
-                NextStep(
-                    f'record {proposal.stem}.csv{both}: {proposal.manoeuvre}, {proposal.why}',
-                    '' if proposal.beside_simulator else proposal.command,
-                )
-            )
-        if proposal is not None and not proposal.concerns_reference:
-            is_closed = self.verdict in ('explained', 'partly')
-            is_alone = bool(is_closed or compared.sim or compared.urdf)
-            given = {
-                '--params': params if is_closed else compared.params,
-                '--sim': f'{proposal.stem}_simulated.csv' if compared.sim else '',
-                '--sim-unit': compared.sim_unit,
-                '--urdf': compared.urdf,
-                '--frame': self._frame,
-                '-o': f'{folder}_2',
-            }
-            before = [] if is_alone else self._stored_recordings
-            steps.append(
-                NextStep(
-                    'diagnose it' if is_alone else 'diagnose it together with this one',
-                    _command((*before, f'{proposal.stem}.csv'), given),
-                )
-            )
-        if not any(effect_named(e).concern is Concern.REFERENCE for e in report.sensor.effects):
-            # The folder is of the diagnosis, so that no input is replaced.
-            simulated = free_name(Path(folder) / 'simulated.csv')
-            words = 'rich', '--params', params, '-o', str(simulated)
-            steps.append(
-                NextStep(
-                    'simulate the sensor as it was found', command('simulate', shlex.join(words))
-                )
-            )
-        return steps
-
-    @property
-    def _stored_recordings(self) -> list[str]:
-        return [_stored(name, 'RECORDING') for name in self.compared.recordings]
-
-    @property
-    def _frame(self) -> str:
-        return self.compared.frame if self.compared.urdf else ''
-
-
-def _stored(name: str, otherwise: str) -> str:
-    """Return the name of a file; another word where samples are in none, '' for no samples."""
-    return name if not name or Path(name).exists() else otherwise
-
-
-def _command(recordings: Sequence[str], given: Mapping[str, str]) -> str:
-    """Return the command of a diagnosis; options without a value are left out."""
-    options = {name: value for name, value in given.items() if value}
-    return command('diagnose', shlex.join([*recordings, *chain.from_iterable(options.items())]))
+        is_closed = self.verdict in ('explained', 'partly')
+        return self.compared.next_steps(self.diagnosis, folder, is_closed)
 
 
 def diagnose(
@@ -482,14 +385,15 @@ def _require_simulator(
     align: bool,
 ) -> None:
     """Refuse arguments that are about a simulator or a robot, where none is given."""
-    if align and sim is None and not urdf:
+    has_other = sim is not None or bool(urdf)
+    if align and not has_other:
         raise UserError(
             f'{option(align=True)}: shifts {option("sim")} or a robot, and neither is given'
         )
     if sim_unit and not isinstance(sim, (str, os.PathLike)):
         raise UserError(
             f'{option(sim_unit=sim_unit)}: states the unit of a file that {option("sim")} names, '
-            'and none is named; samples in memory are given by read(..., unit=...)'
+            'and none is named; samples in memory are given by read or from_arrays(..., unit=...)'
         )
 
 
@@ -497,9 +401,8 @@ def _require_one_reference(
     sim: RecordingInput | Motion | None, urdf: str | os.PathLike | None, count: int
 ) -> None:
     """Refuse a simulator and a robot together, and one of them for several recordings."""
-    if sim is None and not urdf:
-        return
-    if count > 1 or (sim is not None and urdf):
+    references = sum((sim is not None, bool(urdf)))
+    if references > 1 or (references and count > 1):
         raise UserError(
             f'{_name_of(sim) or urdf}: {option("sim")} or {option("urdf")}, one of them, goes '
             f'with one recording, but {count} are given'

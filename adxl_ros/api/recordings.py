@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import hashlib
 import math
+from numbers import Real
 import os
 from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
@@ -25,7 +26,7 @@ from adxl_ros.files.column_mapping import (
 from adxl_ros.files.recording_columns import ACCEL, GYRO, Recording, REFERENCES, TIME, VOLTS
 from adxl_ros.files.tables import in_memory
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
+from adxl_ros.process import option, read_by
 import numpy as np
 
 if TYPE_CHECKING:
@@ -37,9 +38,15 @@ RecordingInput: TypeAlias = 'Recording | DataFrame | Mapping[str, Any] | str | o
 Counts: TypeAlias = float | Sequence[float] | str
 """Counts of an ADC: one number for all axes, one for each, or their text with commas."""
 
+_OUTPUTS = {*ACCEL, *VOLTS}  # Columns of the sensor's output
+_KNOWN = (TIME, *ACCEL, *VOLTS, *GYRO, *REFERENCES)  # Columns of the package
+_TIMES = 'mM'  # Kinds of numpy's types that are times or dates
+_NUMBERS = 'iufb'  # Kinds that are numbers: int, unsigned, float, bool
+_OBJECTS = 'O'  # Kind of arrays of any objects
 _HIGHEST_RATE_HZ = 1e5  # Largest sample rate, Hz: that of a parameter file
 
 
+@read_by('read')
 def read(
     source: RecordingInput,
     *,
@@ -125,8 +132,8 @@ def reading_options(
     drop_bad_samples: bool = False,
 ) -> ReadingOptions:
     """Check how a recording is to be read; see `read`."""
-    is_number = isinstance(rate, (float, int, np.number))
-    if rate is not None and not (is_number and 0 < rate <= _HIGHEST_RATE_HZ):
+    is_number = isinstance(rate, Real)
+    if rate is not None and not 0 < (rate if is_number else math.nan) <= _HIGHEST_RATE_HZ:
         given = option(rate=f'{rate:g}' if is_number else rate)
         raise UserError(f'{given}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}')
     return ReadingOptions(
@@ -170,10 +177,11 @@ def _counts(argument: str, stated: Counts, above: float) -> tuple[float, ...]:
     )
 
 
+@read_by('from_arrays')
 def from_arrays(
     table: Mapping[str, Any] | DataFrame | None = None,
     /,
-    *,
+    *unnamed: Any,
     rate: float | None = None,
     unit: str = '',
     columns: str | Mapping[str, str | tuple[str, str]] | None = None,
@@ -204,6 +212,8 @@ def from_arrays(
         Serial number of the sensor; '' for an unnamed one.
     name
         What messages call it.
+    *unnamed
+        None: arrays have names.
     **arrays
         Arrays (n,): `time_s`, s or dates, rising; the output `ax_mps2, ay_mps2, az_mps2`, m/s², or
         `x_v, y_v, z_v`, V, of one, two or three axes; the references `alpha_rad, beta_rad` of a
@@ -221,10 +231,16 @@ def from_arrays(
         There is no time or no output, lengths differ, or values are no readings of a sensor.
 
     """
+    if unnamed:
+        raise UserError(
+            f'from_arrays: {1 + len(unnamed)} arrays have no names; write for example '
+            'from_arrays(time_s=t, ax_mps2=x)'
+        )
     given = arrays if table is None else {**_columns_of(table, 'from_arrays'), **arrays}
-    unknown = arrays.keys() - _KNOWN
     # Without an output that is known, the reader proposes what the others may be.
-    if unknown and not columns and not _OUTPUTS.isdisjoint(given):
+    is_native = not columns and not _OUTPUTS.isdisjoint(given)
+    unknown = arrays.keys() - _KNOWN
+    if is_native and unknown:
         raise UserError(f'{name}: no array {min(unknown)!r} is known, but {", ".join(_KNOWN)}')
     options = reading_options(
         columns=columns,
@@ -237,10 +253,6 @@ def from_arrays(
         drop_bad_samples=drop_bad_samples,
     )
     return _of_memory(given, name, options, serial)
-
-
-_OUTPUTS = {*ACCEL, *VOLTS}  # Columns of the sensor's output
-_KNOWN = (TIME, *ACCEL, *VOLTS, *GYRO, *REFERENCES)  # Columns of the package
 
 
 def _is_frame(given: Any) -> bool:
@@ -319,11 +331,6 @@ def _rows_of(columns: Mapping[str, np.ndarray], name: str) -> int:
     return shape[0]
 
 
-_TIMES = 'mM'  # Kinds of numpy's types that are times or dates
-_NUMBERS = 'iufb'  # Kinds that are numbers: int, unsigned, float, bool
-_OBJECTS = 'O'  # Kind of arrays of any objects
-
-
 def _floats(given: Any) -> np.ndarray | None:
     """Return numbers as floats and times as ns, NaN where masked or missing; None for others."""
     try:
@@ -366,7 +373,12 @@ def one_recording(given: RecordingInput) -> Recording:
         raise _no_recording(given)
     for name, values in _samples(given).items():
         numbers = _floats(values)
-        if numbers is None or numbers.shape != (len(given),) or not np.isfinite(numbers).all():
+        is_whole = (
+            numbers is not None
+            and numbers.shape == (len(given),)
+            and bool(np.isfinite(numbers).all())
+        )
+        if not is_whole:
             raise UserError(
                 f'{given.path}: {name} is masked or no finite number in some of the {len(given)} '
                 'samples; leave these out by from_arrays(..., drop_bad_samples=True)'

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import NO_SERIAL, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import neutral, Sensor, typical

@@ -21,7 +21,8 @@ from adxl_ros.api.sensors import (
 )
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import concatenate, Recording, sensor_info, TIME
+from adxl_ros.files.recording_columns import concatenate, Recording, TIME
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern

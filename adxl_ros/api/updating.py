@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.api.recordings import each_recording, RecordingInput
-from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
+from adxl_ros.api.result import (
+    as_json,
+    FirstScreen,
+    no_progress,
+    Progress,
+    require_number,
+    Result,
+)
 from adxl_ros.api.sensors import as_input, load, SensorInput
 from adxl_ros.calibrate.keep import update_report as words
 from adxl_ros.calibrate.keep.keeper import Keeper, KeepSettings, KeptState
@@ -20,8 +27,10 @@ from adxl_ros.calibrate.keep.update_report import UpdatedDay
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
-from adxl_ros.files.recording_columns import check_same_sensor, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import counted, number, utc
 from adxl_ros.report.screen import Tile
@@ -190,6 +199,7 @@ def update(
         The calibration has no uncertainty, or a recording is of another unit or out of order.
 
     """
+    require_number(option(drift_mg_per_year=drift_mg_per_year), drift_mg_per_year)
     given = as_input(sensor)
     before = given if isinstance(given, Sensor) else load(given or '')
     keeper = Keeper(before, KeepSettings(drift_mg_per_year))

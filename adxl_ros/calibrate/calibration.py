@@ -29,7 +29,7 @@ from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg, with_half_width
-from adxl_ros.signals import recorded_sensor
+from adxl_ros.signals import filter_noise, polarity
 from adxl_ros.signals.gravity_at_rest import of_volts, require_unit
 import numpy as np
 
@@ -44,7 +44,7 @@ class RecordedPoses:
     source: str  # Name of the recording, for messages and the provenance
     poses: Poses  # With angles or without
     # Estimated output filter of each axis
-    filters: Sequence[recorded_sensor.FilterNoise | None] = ()
+    filters: Sequence[filter_noise.FilterNoise | None] = ()
     faults: Sequence[str] = ()  # What is wrong between the samples, one line each
 
 
@@ -183,7 +183,7 @@ def _against_stage(
         details += full_model.report_lines(fit.full, poses.subset(fitting), fit.terms)
         warnings += full_model.warnings(fit.full, poses.subset(fitting))
     if fitted.model == 'full':
-        fitted, filter_lines = recorded_sensor.with_filter(
+        fitted, filter_lines = filter_noise.with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters]
         )
         details += filter_lines
@@ -223,8 +223,8 @@ def _check_polarity(sensor: Sensor, poses: Poses) -> None:
         correlation = np.array(
             [[np.corrcoef(volts, force)[0, 1] for force in reference] for volts in poses.volts.T]
         )
-    fault = recorded_sensor.find_polarity_fault(
-        correlation, sensor.axis_indices, recorded_sensor.CERTAIN_CORRELATION
+    fault = polarity.find_polarity_fault(
+        correlation, sensor.axis_indices, polarity.CERTAIN_CORRELATION
     )
     if fault is not None:
         raise UserError(fault.describe(sensor.axes[fault.axis], AXES[fault.follows]))

@@ -20,8 +20,11 @@ from adxl_ros.files.tables import PoseTable
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
-from adxl_ros.signals import recorded_sensor, rest_detection
-from adxl_ros.signals.rest_detection import Rest
+from adxl_ros.signals import filter_noise
+from adxl_ros.signals.rest_detection import recording_finder
+from adxl_ros.signals.rest_limits import datasheet_noise
+from adxl_ros.signals.rest_means import rest_means
+from adxl_ros.signals.rest_search import Rest
 import numpy as np
 
 _MAX_PERIODS = 1.5
@@ -89,12 +92,12 @@ def extract_poses(
             f'{recording.path}: the sensor is nowhere at rest; hold it still for at '
             'least 1 s in each pose'
         )
-    volts, std_v = rest_detection.rest_means(
+    volts, std_v = rest_means(
         recording.time_s,
         recording.volts(sensor),
         rests,
         sensor.rate_hz,
-        rest_detection.datasheet_noise(sensor),
+        datasheet_noise(sensor),
     )
     measured = {
         'volts': volts,
@@ -122,7 +125,7 @@ def extract_poses(
 def _found_rests(recording: Recording, sensor: Sensor) -> list[Rest]:
     """Find the rests in the samples and, where there are any, in the angles of the stage."""
     angles = recording.stage_angles
-    finder = rest_detection.recording_finder(sensor, angles is not None)
+    finder = recording_finder(sensor, angles is not None)
     finder.feed(recording.time_s, recording.volts(sensor), angles)
     return finder.rests()
 
@@ -217,7 +220,7 @@ def with_table_angles(poses: Poses, table: PoseTable) -> Poses:
 
 def estimate_filters(
     recording: Recording, sensor: Sensor, poses: Poses
-) -> list[recorded_sensor.FilterNoise | None]:
+) -> list[filter_noise.FilterNoise | None]:
     """Estimate the output filter of each axis from the noise of the poses."""
     volts = recording.volts(sensor)
     gapless = []
@@ -226,7 +229,7 @@ def estimate_filters(
         if steps_s.size and steps_s.max() * sensor.rate_hz < _MAX_PERIODS:
             gapless.append(volts[begin : end + 1])
     return [
-        recorded_sensor.estimate_filter(
+        filter_noise.estimate_filter(
             [rest[:, d] for rest in gapless], sensor.rate_hz, sensor.rc_s, sensor.lsb_v
         )
         for d in range(len(sensor.axes))

@@ -19,7 +19,7 @@ from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import AnyPath, keep_previous
-from adxl_ros.files.recording_columns import NO_SERIAL
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.accelerometer import OTHER_AXIS

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, StreamInfo
+from adxl_ros.files.stream_info import check_same_sensor, NO_SERIAL, StreamInfo
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor

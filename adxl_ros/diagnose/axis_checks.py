@@ -21,7 +21,7 @@ from adxl_ros.model.sensor import to_nominal_mps2
 from adxl_ros.process import option
 from adxl_ros.report.quantities import listed
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.signals.recorded_sensor import find_polarity_fault
+from adxl_ros.signals.polarity import find_polarity_fault
 import numpy as np
 
 _FEWEST_SAMPLES = 50  # Fewest samples of any recording. Chosen: one for each of 48 blocks

@@ -35,7 +35,8 @@ from adxl_ros.diagnose.search import Hypothesis, Search, with_filters
 from adxl_ros.diagnose.verdict import MATERIAL_MG, Verdict
 from adxl_ros.diagnose.verdict_sensor import as_printed, named_sensor, with_likely_drift
 from adxl_ros.diagnose.weighing import Evidence, HEALTHY, SimulatedAgain
-from adxl_ros.files.recording_columns import check_same_sensor, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor, with_axes, with_neutral
@@ -426,12 +427,9 @@ def _report(
 
 def what_shows(
     recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None
-) -> list[CouldShow] | DataFault:
-    """Return what recordings can show, before any diagnosis; or why they cannot be compared."""
-    try:
-        checked = check(recordings, sensor, sim)
-    except DataFault as fault:
-        return fault
+) -> list[CouldShow]:
+    """Return what recordings can show, before any diagnosis; raise why they cannot be compared."""
+    checked = check(recordings, sensor, sim)
     model = build_linear_model([c.search_comparison for c in checked])
     floor = estimate_floor([c.comparison for c in checked])
     return could_show(model, checked[0].comparison, floor.noise_v, material_mps2(model, floor))

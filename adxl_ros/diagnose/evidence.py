@@ -362,7 +362,7 @@ class LinearisedHypothesis:
         """Fit all coefficients to some blocks, (blocks,) bool, or to all."""
         return fit_columns(
             self.channels,
-            range(len(self.names)),
+            range(len(self.prior_std)),
             self.prior_std,
             blocks,
             drifts=(*drifts, *drifts_among(self.sensor.effects)),

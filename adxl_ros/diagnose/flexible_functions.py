@@ -10,8 +10,9 @@ has functions of its own, by dimension.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 
 from adxl_ros.diagnose import comparison as beside
@@ -59,9 +60,11 @@ Basis = dict[Form, np.ndarray]
 combination with coefficients of standard deviation 1 has an rms of 1."""
 
 
-def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> Iterator[Basis]:
+def flexible_bases(
+    comparison: BaselineComparison, baseline_v: np.ndarray, chosen: Collection[Form] = tuple(Form)
+) -> Iterator[Basis]:
     """
-    Yield the flexible functions of a recording, one basis for each axis.
+    Yield the flexible functions of a recording over chosen quantities, one basis for each axis.
 
     Those of temperature and supply also multiply the force, because they change the scale factor,
     and those of the angles its slope over the angle, because they are errors of the angle.
@@ -69,7 +72,7 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> It
     """
     sensor = comparison.sensor
     force_g = ((baseline_v - sensor.zero_g_v) / sensor.scale_v_per_g).T
-    common = _common(comparison)
+    common = _made(_common(comparison), chosen)
     slopes = np.zeros((2, len(AXES), 0))
     if comparison.joints:
         slopes = gravity_slopes(*comparison.joint_values())
@@ -85,9 +88,18 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> It
             if dimension in common:
                 plain = common[dimension]
                 functions[dimension] = np.concatenate([plain, plain * factor])
-        functions |= _of_axis(comparison, force_g, axis, baseline_v[:, axis])
+        functions |= _made(_of_axis(comparison, force_g, axis, baseline_v[:, axis]), chosen)
         basis = {d: _normalised(values, comparison.used) for d, values in functions.items()}
         yield {d: values for d, values in basis.items() if values.shape[1]}
+
+
+_Makers = dict[Form, Callable[[], np.ndarray]]
+"""What makes functions, (k, n), by dimension."""
+
+
+def _made(makers: _Makers, chosen: Collection[Form]) -> Basis:
+    """Make the functions of chosen dimensions."""
+    return {dimension: make() for dimension, make in makers.items() if dimension in chosen}
 
 
 def _normalised(functions: np.ndarray, used: np.ndarray) -> np.ndarray:
@@ -100,39 +112,43 @@ def _normalised(functions: np.ndarray, used: np.ndarray) -> np.ndarray:
     return (centred[varying] / size).T
 
 
-def _common(comparison: BaselineComparison) -> Basis:
-    """Return functions that are the same for all axes, (k, n) each, not yet normalised."""
-    basis: Basis = {Form.TIME: _modes(comparison.time_s, Form.TIME, 1.0)}
+def _common(comparison: BaselineComparison) -> _Makers:
+    """Return what makes functions that are the same for all axes, not yet normalised."""
+    makers: _Makers = {Form.TIME: partial(_modes, comparison.time_s, Form.TIME, 1.0)}
     for name, values in comparison.surroundings.items():
         if np.ptp(values) > _SMALLEST_CHANGE[name]:
-            basis[Form(name)] = _modes(values, Form(name))
+            makers[Form(name)] = partial(_modes, values, Form(name))
             if Form(name) is Form.TEMPERATURE:
-                basis[Form.WARMING] = _thermal_history(values, comparison.dt_s)
+                makers[Form.WARMING] = partial(_thermal_history, values, comparison.dt_s)
     if comparison.joints:
         alpha_rad, beta_rad = comparison.joint_values()
-        basis[Form.ALPHA] = _modes(alpha_rad, Form.ALPHA)
-        basis[Form.BETA] = _harmonics(beta_rad, _BETA_HARMONICS)
-    return basis
+        makers[Form.ALPHA] = partial(_modes, alpha_rad, Form.ALPHA)
+        makers[Form.BETA] = partial(_harmonics, beta_rad, _BETA_HARMONICS)
+    return makers
 
 
 def _of_axis(
     comparison: BaselineComparison, force_g: np.ndarray, axis: int, volts: np.ndarray
-) -> Basis:
-    """Return functions of the force along and across one axis and of its history, (k, n) each."""
+) -> _Makers:
+    """Return what makes functions of the force along and across one axis and of its history."""
     along_g = force_g[axis]
     if np.ptp(along_g) < _SMALLEST_SPREAD:
         return {}
-    basis = {
-        Form.FORCE: _modes(along_g, Form.FORCE),
-        Form.CROSS_FORCE: _cross_force(force_g, axis),
-        Form.AGEING: along_g * _modes(comparison.time_s, Form.AGEING),
-        Form.CODE: _codes(volts, comparison.sensor.adc_vref_v),
-        Form.LAG: _force_history(along_g, comparison.dt_s),
+    makers: _Makers = {
+        Form.FORCE: partial(_modes, along_g, Form.FORCE),
+        Form.CROSS_FORCE: partial(_cross_force, force_g, axis),
+        Form.AGEING: lambda: along_g * _modes(comparison.time_s, Form.AGEING),
+        Form.CODE: partial(_codes, volts, comparison.sensor.adc_vref_v),
+        Form.LAG: partial(_force_history, along_g, comparison.dt_s),
     }
     moves = _Moves.of(comparison)
     if moves.moving:
-        basis |= _of_moves(moves, along_g, comparison)
-    return basis
+        makers |= {
+            Form.RATE: partial(_by_rate, moves, along_g),
+            Form.DIRECTION: partial(_by_direction, moves, along_g),
+            Form.SINCE_MOVE: partial(_since_move, moves, along_g, comparison),
+        }
+    return makers
 
 
 def _cross_force(force_g: np.ndarray, axis: int) -> np.ndarray:
@@ -191,32 +207,37 @@ class _Moves:
         return cls(rates, [rate / np.abs(rate).max() for rate in moving])
 
 
-def _of_moves(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> Basis:
-    """Return functions of rate and direction of the joints, and of the time since a move."""
-    by_rate = []
+def _by_rate(moves: _Moves, along_g: np.ndarray) -> np.ndarray:
+    """Return functions of the rates of the joints, (k, n)."""
+    functions = []
     for rate in moves.moving:
-        by_rate += [rate, rate * rate, rate * along_g, np.abs(rate)]
+        functions += [rate, rate * rate, rate * along_g, np.abs(rate)]
+    return np.array(functions)
+
+
+def _by_direction(moves: _Moves, along_g: np.ndarray) -> np.ndarray:
+    """Return functions of the directions of the last changes of joints and force, (k, n)."""
     change_g = np.diff(along_g, prepend=along_g[0])
     directions = [direction_of_last_move(rate) for rate in moves.rates]
     directions.append(direction_of_last_move(change_g, np.abs(change_g).max() * _SMALLEST_TURN))
-    by_direction = []
+    functions = []
     for direction in directions:
-        by_direction += [direction, direction * along_g]
+        functions += [direction, direction * along_g]
+    return np.array(functions)
+
+
+def _since_move(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> np.ndarray:
+    """Return functions of the time since a move, and of recent turning and force, (k, n)."""
     since_s = beside.time_since_move_s(comparison.time_s, moves.rates)
     turning = np.sum(
         [np.abs(rate) * (np.abs(rate) > _SMALLEST_RATE_RAD_S) for rate in moves.moving], axis=0
     )
-    since_move = [np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S]
+    functions = [np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S]
     for tau_s in _RELAXATION_S:
-        since_move += [
+        functions += [
             low_pass(past, tau_s, comparison.dt_s, {}) for past in (turning, np.sign(turning))
         ]
-    since_move += _lags(along_g, _CREEP_S, comparison.dt_s)
-    return {
-        Form.RATE: np.array(by_rate),
-        Form.DIRECTION: np.array(by_direction),
-        Form.SINCE_MOVE: _same_size(since_move),
-    }
+    return _same_size(functions + _lags(along_g, _CREEP_S, comparison.dt_s))
 
 
 def _lags(values: np.ndarray, times_s: Iterable[float], dt_s: float) -> list[np.ndarray]:

@@ -20,7 +20,7 @@ import scipy
 INTEGRATED_S = 10.0
 """Time over which the acceleration is integrated, s. Chosen: a short loss of other sensors."""
 
-Figure = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
+GapFunction = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
 """Size of a gap by times, s, (n,), and recorded and simulated acceleration, m/s², (n, 3)."""
 
 
@@ -29,7 +29,7 @@ class GapQuantity(NamedTuple):
 
     name: str
     unit: str
-    figure: Figure
+    size: GapFunction
 
 
 class GapInUnit(NamedTuple):
@@ -86,8 +86,8 @@ def quantity(text: str) -> GapQuantity:
         return _QUANTITIES[text]
     module, _, name = text.partition(':')
     try:
-        figure = getattr(import_module(module), name)
-        return GapQuantity(name, getattr(figure, 'unit', ''), figure)
+        size = getattr(import_module(module), name)
+        return GapQuantity(name, getattr(size, 'unit', ''), size)
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(
             f'{option(quantity=text)}: {one_line(error)}; give {", ".join(_QUANTITIES)}, or '
@@ -104,12 +104,12 @@ def gap_in(
 ) -> GapInUnit:
     """Return the gap before and after what was found, and the same figure of noise alone."""
 
-    def figure(comparison: BaselineComparison, recorded_v: np.ndarray, sensor: Sensor) -> float:
+    def size(comparison: BaselineComparison, recorded_v: np.ndarray, sensor: Sensor) -> float:
         used = comparison.used & np.isfinite(recorded_v).all(axis=1)
         recorded = _acceleration(recorded_v[used], baseline)
         simulated = _acceleration(comparison.simulated_v(sensor)[used], baseline)
         try:
-            return float(chosen.figure(comparison.time_s[used], recorded, simulated))
+            return float(chosen.size(comparison.time_s[used], recorded, simulated))
         except UserError:
             raise
         except Exception as error:
@@ -117,12 +117,12 @@ def gap_in(
                 f'{option(quantity=chosen.name)}: {type(error).__name__}: {one_line(error)}'
             ) from None
 
-    before = [figure(c, c.volts, baseline) for c in comparisons]
-    after = [figure(c, c.volts, found) for c in comparisons]
-    noise = [
-        figure(c, c.simulated_v(found) + c.simulated_noise_v(found, seed), found)
-        for c in comparisons
-    ]
+    before = [size(c, c.volts, baseline) for c in comparisons]
+    after = [size(c, c.volts, found) for c in comparisons]
+    noise = []
+    for c in comparisons:
+        drawn_v = c.simulated_v(found) + c.simulated_noise_v(found, seed)
+        noise.append(size(c, drawn_v, found))
     return GapInUnit(chosen.name, chosen.unit, rms(before), rms(after), rms(noise))
 
 

@@ -5,18 +5,28 @@ What a set of effects leaves of samples that it was not fitted to.
 Blocks of time are held out in turn, and the blocks next to them are not fitted. A set of effects
 is fitted to the other blocks and predicts the ones left out. Zero-g, scale factor, filter and
 latency are free beside it, within what a healthy, calibrated unit may differ by.
+
+Few effects have exactly the form of the library. Where a set is compared with a part of itself,
+flexible functions of the variables of these effects stand beside both (embedded errors of form;
+Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63), so that an error of form feeds itself, and not
+a further effect.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain, repeat
 from typing import NamedTuple, TYPE_CHECKING
 
 from adxl_ros.diagnose import evidence as linear
 from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis
+from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.noise_filters import expected_drift_g, Whitener
+from adxl_ros.diagnose.search import with_filters
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects import effect_named
 from adxl_ros.signals.block_statistics import rms
 import numpy as np
 
@@ -26,6 +36,29 @@ if TYPE_CHECKING:
 FOLDS = 4  # Parts of a recording, each of which is held out once. Chosen: run time
 _RUN_BLOCKS = 2
 """Neighbouring blocks that are held out together. Chosen: slow effects change within two."""
+_FORM_ERROR = 0.1
+"""Prior rms of an error of form, divided by that of its effect. Chosen: a curve that differs by
+more is another effect."""
+
+
+def _with_columns(
+    linearised: LinearisedHypothesis, columns: Iterable[np.ndarray]
+) -> LinearisedHypothesis:
+    """Add columns to each channel, (n, h), whose coefficients have standard deviations of 1."""
+    count = first = len(linearised.prior_std)
+    widened = []
+    for channel, further in zip(linearised.columns, columns):
+        numbers = count + np.arange(further.shape[1])
+        count += len(numbers)
+        places = np.insert(channel.places, channel.own.shape[1] - 1, numbers)
+        own = np.hstack([channel.own, further])
+        widened.append(channel._replace(places=places, own=own))
+    return replace(
+        linearised,
+        prior_std=np.append(linearised.prior_std, np.ones(count - first)),
+        reach=np.append(linearised.reach, np.full(count - first, np.inf)),
+        columns=widened,
+    )
 
 
 class HeldOut(NamedTuple):
@@ -54,6 +87,29 @@ class HeldOutFits:
     model: LinearModel
     # Effects by which the zero-g may drift more than that of a healthy unit
     drifts: tuple[str, ...] = ()
+    # Figures beside errors of form, as far as they were asked for, by the effects that have them
+    beside_errors: dict[frozenset[str], HeldOut] = field(default_factory=dict)
+
+    def beside_form_errors(self, effects: frozenset[str]) -> HeldOut:
+        """Return the figures where some effects of the set have errors of form, too."""
+        if effects not in self.beside_errors:
+            wider = _with_columns(self.linearised, self._form_errors(effects))
+            filtered = with_filters(self.model, wider, [[w] for w in self._whiteners])
+            self.beside_errors[effects] = HeldOutFits(filtered, self.model, self.drifts).figures
+        return self.beside_errors[effects]
+
+    def _form_errors(self, effects: frozenset[str]) -> Iterator[np.ndarray]:
+        """Yield for each channel what errors of form may be, V, one standard deviation each."""
+        model, linearised = self.model, self.linearised
+        forms = {e: form for e in effects if (form := effect_named(e).diagnosis.form)}
+        chosen = set(chain(*forms.values()))
+        bases = map(flexible_bases, model.comparisons, model.baseline_v, repeat(chosen))
+        for columns, basis, channel in zip(linearised.columns, chain(*bases), model.places):
+            own = [k for k, i in enumerate(columns.places) if linearised.names[i].effect in forms]
+            values = linearised.values[columns.places[own]]
+            change_v = columns.own[:, 1:][:, own] @ values
+            size_v = _FORM_ERROR * float(change_v[channel.comparison.used].std())
+            yield size_v * np.hstack([columns.own[:, :0], *basis.values()])
 
     @cached_property
     def full(self) -> LinearFit:

@@ -52,19 +52,29 @@ _COARSE_S = 0.05  # Step of the search for a step, s. Chosen: below a period of 
 _SMALLEST_STEP_S = 5e-3  # Smallest step of a clock, s. Chosen: less is jitter
 
 
-class Correlations(NamedTuple):
-    """Correlations of two motions by lag, (lags,) each."""
+class Shifts(NamedTuple):
+    """How well two motions fit, by shift, (lags,) each."""
 
-    lags: np.ndarray  # Sample i of the first meets sample i + lag of the second
+    lags_s: np.ndarray  # How much later the second one is, s
     overlap: np.ndarray  # Number of samples that overlap
     correlation: np.ndarray  # −1 where too few overlap, or one does not move
 
+    @property
+    def late_s(self) -> float:
+        """Return the best shift, s."""
+        return float(self.lags_s[np.argmax(self.correlation)])
 
-def correlations(first: np.ndarray, second: np.ndarray, smallest: int) -> Correlations:
+    @property
+    def fits(self) -> bool:
+        """Return whether both are the same motion at their best shift."""
+        return bool(self.correlation.max() > CORRELATED)
+
+
+def correlate(first: np.ndarray, second: np.ndarray, step_s: float, smallest: int) -> Shifts:
     """
     Correlate two motions, g, (n, m) and (n', m), at all lags, each over the samples that overlap.
 
-    At least `smallest` samples must overlap.
+    step_s: time between two samples; at least `smallest` samples must overlap.
     """
 
     def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -82,30 +92,15 @@ def correlations(first: np.ndarray, second: np.ndarray, smallest: int) -> Correl
     smallest_square = SMALLEST_MOTION_G**2 * overlap
     compared = (overlap >= smallest) & (squares > smallest_square).all(axis=0)
     correlation = covariance / np.sqrt(np.maximum(squares, smallest_square).prod(axis=0))
-    return Correlations(
-        scipy.signal.correlation_lags(len(second), len(first)),
-        overlap,
-        np.where(compared, correlation, -1.0),
-    )
+    lags = scipy.signal.correlation_lags(len(second), len(first))
+    return Shifts(lags * step_s, overlap, np.where(compared, correlation, -1.0))
 
 
-class Shifts(NamedTuple):
-    """How well a part of a recording fits a simulator, by shift, (lags,) each."""
+class Part(NamedTuple):
+    """A part of a recording that fits a simulator at one shift."""
 
     time_s: np.ndarray  # Instants of the part, s, (k,)
-    lags_s: np.ndarray  # How much later the simulator is stamped, s
-    overlap: np.ndarray  # Number of instants that overlap
-    correlation: np.ndarray  # −1 where too few overlap
-
-    @property
-    def late_s(self) -> float:
-        """Return the best shift, s."""
-        return float(self.lags_s[np.argmax(self.correlation)])
-
-    @property
-    def fits(self) -> bool:
-        """Return whether the part fits at its best shift."""
-        return bool(self.correlation.max() > CORRELATED)
+    late_s: float  # How much later the simulator is stamped, s
 
 
 class Motions(NamedTuple):
@@ -140,20 +135,20 @@ class Motions(NamedTuple):
 
     def shifts(self, rows: np.ndarray, smallest: int) -> Shifts:
         """Correlate a part of the recording, rows, with the simulator at all shifts."""
-        time_s = self.measured_s[rows]
-        found = correlations(self.measured_g[rows], self.stated_g, smallest)
-        lags_s = self.stated_s[0] - time_s[0] + found.lags * self.step_s
-        return Shifts(time_s, lags_s, found.overlap, found.correlation)
+        found = correlate(self.measured_g[rows], self.stated_g, self.step_s, smallest)
+        begin_s = self.stated_s[0] - self.measured_s[rows[0]]
+        return found._replace(lags_s=begin_s + found.lags_s)
 
-    def fitting_parts(self) -> list[Shifts]:
+    def fitting_parts(self) -> list[Part]:
         """Return the parts of the recording that fit the simulator at one shift each."""
         time_s = self.measured_s
         count = max(min(int(np.ptp(time_s) / _PART_S), _MOST_PARTS), 1)
-        parts = [
-            self.shifts(rows, round(_OVERLAP_OF_PART * len(rows)))
-            for rows in np.array_split(np.arange(len(time_s)), count)
-        ]
-        return [part for part in parts if part.fits]
+        parts = []
+        for rows in np.array_split(np.arange(len(time_s)), count):
+            shifts = self.shifts(rows, round(_OVERLAP_OF_PART * len(rows)))
+            if shifts.fits:
+                parts.append(Part(time_s[rows], shifts.late_s))
+        return parts
 
     def stated_at(self, late_s: np.ndarray | float) -> np.ndarray:
         """Return the simulator beside the recording, g, (n, m), at shifts, s, (n,) or ()."""
@@ -217,7 +212,7 @@ class Drift(NamedTuple):
         """Return the mean square that it leaves, g²."""
         return motions.left_g2(np.linspace(*self, len(motions.measured_s)))
 
-    def explains(self, part: Shifts, motions: Motions) -> bool:
+    def explains(self, part: Part, motions: Motions) -> bool:
         """Return whether the shift of a part is that of an instant in it, to half a step."""
         ends_s = np.interp(part.time_s[[0, -1]], motions.measured_s[[0, -1]], self)
         resolution_s = motions.step_s / 2
@@ -239,7 +234,7 @@ def _fit_drift(motions: Motions, ends_s: np.ndarray) -> Drift:
     return Drift(*map(float, fitted.x))
 
 
-def find_drift(motions: Motions, parts: Sequence[Shifts]) -> Drift | None:
+def find_drift(motions: Motions, parts: Sequence[Part]) -> Drift | None:
     """
     Return the drift that explains the shifts of all parts.
 
@@ -289,7 +284,7 @@ def _step_between(motions: Motions, before_s: float, after_s: float) -> ClockSte
 
 
 def find_step(
-    motions: Motions, recording: Recording, about_s: float, parts: Sequence[Shifts]
+    motions: Motions, recording: Recording, about_s: float, parts: Sequence[Part]
 ) -> ClockStep | None:
     """
     Find where the shift steps, if it does.

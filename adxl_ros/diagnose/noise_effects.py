@@ -256,7 +256,9 @@ def _stands_alone(volts: np.ndarray, smallest_v: np.ndarray, distance: int) -> n
 
 def _least_difference_v(volts: np.ndarray, distance: int) -> np.ndarray:
     """Return the smaller difference of each sample from those before and behind it, V, (n,)."""
-    return np.minimum(*(np.abs(volts - np.roll(volts, d)) for d in (distance, -distance)))
+    before_v = np.abs(volts - np.roll(volts, distance))
+    behind_v = np.abs(volts - np.roll(volts, -distance))
+    return np.minimum(before_v, behind_v)
 
 
 def _spikes(
@@ -356,42 +358,62 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
 
     Where the reference is not known, a jerk of the motion would look like an isolated sample.
     """
-    volts, time_s, sensor = comparison.volts, comparison.time_s, comparison.sensor
-    finite, known = np.isfinite(volts).all(axis=1), comparison.used | comparison.disturbed
+    sensor = comparison.sensor
+    volts = comparison.volts
+    time_s = comparison.time_s
+    residual_v = comparison.residual_v(sensor)
+    finite = np.isfinite(volts).all(axis=1)
+    known = comparison.used | comparison.disturbed
     coarse = coarse_codes(volts, sensor)
-    # Coarse codes repeat by themselves.
-    changing, detections = (
-        (finite, [coarse]) if coarse else repeated_samples(volts, time_s, finite, sensor)
-    )
-    residual_v = comparison.residual_v(comparison.sensor)
-
-    def among(compared: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
-        regular, spikes = isolated_samples(volts, residual_v, time_s, compared, sensor)
-        return compared & ~regular, spikes
-
-    isolated, spikes = among(changing & known)
-    if spikes and not coarse:
+    changing = finite
+    if coarse is None:
+        changing, detections = repeated_samples(volts, time_s, finite, sensor)
+    else:
+        # Coarse codes repeat by themselves.
+        detections = [coarse]
+        sensor = coarse.added_to(sensor)
+    compared = changing & known
+    regular, spikes = isolated_samples(volts, residual_v, time_s, compared, comparison.sensor)
+    if spikes and coarse is None:
+        isolated = compared & ~regular
         changing, detections = repeated_samples(volts, time_s, finite, sensor, isolated)
-        isolated, spikes = among(changing & known)
+        compared = changing & known
+        regular, spikes = isolated_samples(volts, residual_v, time_s, compared, sensor)
+    held, clipping = _held(comparison)
+    if clipping is not None:
+        detections = [*detections, clipping]
+    return SampleFaults(
+        repeated=finite & ~changing,
+        isolated=compared & ~regular,
+        held=held,
+        detections=detections,
+        possible_spikes=spikes,
+        sensor=sensor,
+    )
+
+
+def _held(comparison: BaselineComparison) -> tuple[np.ndarray, Detection | None]:
+    """Find samples at an end of the range of an axis, (n, m) bool, unless most of them are."""
+    volts = comparison.volts
+    sensor = comparison.sensor
     simulated_v = comparison.simulated_v(sensor)
     steps_v = np.maximum(code_step_v(volts), sensor.lsb_v)
     moved_v = np.maximum(_HELD_STEPS * steps_v, SMALLEST_RANGE_V)
     low = _held_at_end(-volts, -simulated_v, moved_v)
     high = _held_at_end(volts, simulated_v, moved_v)
     held = low | high
-    if held.any(axis=1).mean() > _LARGEST_HELD_SHARE:
-        held = np.zeros_like(held)
-    if held.any():
-        detections = [*detections, _clipping(comparison, low, high)]
-    stepped = coarse.added_to(sensor) if coarse else sensor
-    return SampleFaults(finite & ~changing, isolated, held, detections, spikes, stepped)
+    is_most = held.any(axis=1).mean() > _LARGEST_HELD_SHARE
+    if is_most or not held.any():
+        return np.zeros_like(held), None
+    return held, _clipping(comparison, low, high)
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     """Find an ADC whose codes are coarser than stated, on all axes or on some."""
     if not sensor.lsb_v:
         return None
-    bits, threshold = np.array([_lost_bits(v, sensor) for v in volts.T]), np.log2(COARSE_STEPS)
+    bits = np.array([_lost_bits(v, sensor) for v in volts.T])
+    threshold = np.log2(COARSE_STEPS)
     if not (bits >= threshold).any():
         return None
     fewest = float(np.nanmin(bits))
@@ -454,24 +476,20 @@ def _excess(
     resting: bool,
 ) -> Detection | None:
     """Find noise above the level of drawn noise in samples, (n,) bool, that may rest."""
-    recorded, drawn = (white_noise_v(v, sensor, rows) for v in (residual_v, simulated_v))
+    recorded = white_noise_v(residual_v, sensor, rows)
+    drawn = white_noise_v(simulated_v, sensor, rows)
     # The level of noise far below a step of the ADC does not show.
     shows = (noise.held_rounding(sensor) <= 0.5) & (drawn > 0)
     ratio = recorded / np.where(shows, drawn, np.inf)
     if resting:
         # Noise past the RC filter looks excessive in the innovations, but not in the samples.
-        recorded_v, drawn_v = (np.std(v[rows], axis=0) for v in (residual_v, simulated_v))
+        recorded_v = np.std(residual_v[rows], axis=0)
+        drawn_v = np.std(simulated_v[rows], axis=0)
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
-    return (
-        None
-        if np.max(ratio) <= NOISE_EXCESS
-        else _detection(
-            Detector.NOISE_LEVEL,
-            np.maximum(ratio**2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2,
-            sensor,
-            ratio=ratio - 1,
-        )
-    )
+    if np.max(ratio) <= NOISE_EXCESS:
+        return None
+    power_v2 = np.maximum(ratio**2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2
+    return _detection(Detector.NOISE_LEVEL, power_v2, sensor, ratio=ratio - 1)
 
 
 def _periodogram(
@@ -508,7 +526,8 @@ def _line(
     """Return the mains line that is the strongest of a whitened residual, or None."""
     frequency_hz, power = _periodogram(white, sensor.rate_hz, 'hann')
     kept = frequency_hz > _LINE_LOWEST_HZ
-    frequency_hz, power = frequency_hz[kept], power[kept]
+    frequency_hz = frequency_hz[kept]
+    power = power[kept]
     if len(frequency_hz) < _LINE_FEWEST_ORDINATES:
         return None
     # The local level is the mean of the ordinates around, by their median.
@@ -542,11 +561,12 @@ def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -
     parts = max(len(values_v) // max(int(np.searchsorted(time_s, time_s[0] + _LINE_PART_S)), 1), 1)
     length = len(values_v) // parts
     window = np.hanning(length + 2)[1:-1]
-    at_s, series = time_s[: parts * length].reshape(parts, length), values_v[: parts * length]
+    at_s = time_s[: parts * length].reshape(parts, length)
+    series = values_v[: parts * length].reshape(parts, length, -1)
     squares = []
     for offset in (0.0, -_LINE_BESIDE, _LINE_BESIDE):
         turn = np.exp(-2j * np.pi * (line_hz + offset / _LINE_PART_S) * at_s) * window
-        peaks = 2 * np.einsum('pl,plm->pm', turn, series.reshape(parts, length, -1)) / window.sum()
+        peaks = 2 * np.einsum('pl,plm->pm', turn, series) / window.sum()
         squares.append(np.mean(np.abs(peaks) ** 2, axis=0))
     return np.sqrt(np.maximum(squares[0] - (squares[1] + squares[2]) / 2, 0.0))
 
@@ -571,29 +591,36 @@ def compare_noise(
     log likelihood is that of the recorded spectrum under the simulated power of each band
     (Whittle 1953).
     """
-    rate_hz, scale = comparison.sensor.rate_hz, comparison.scale_v_per_mps2
+    rate_hz = comparison.sensor.rate_hz
+    scale = comparison.scale_v_per_mps2
     times_s = [t for t in _TIMES_S if t * rate_hz >= 2 and 10 * t < len(comparison) / rate_hz]
     frequency_hz = np.fft.rfftfreq(len(comparison), 1 / rate_hz)
     edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
     edges_hz[0] = 0.0
     bands = [(frequency_hz > low) & (frequency_hz <= high) for low, high in pairwise(edges_hz)]
+    counts = [round(t * rate_hz) for t in times_s]
     log_likelihoods = []
     ratios: dict[str, Any] = {}
     for label, (mean, noisy) in sensors.items():
-        series = [
-            bridged(v, comparison.used) / scale
-            for v in (comparison.residual_v(mean), comparison.simulated_noise_v(noisy, seed))
+        recorded = bridged(comparison.residual_v(mean), comparison.used) / scale
+        simulated = bridged(comparison.simulated_noise_v(noisy, seed), comparison.used) / scale
+        recorded_power = _periodogram(recorded, rate_hz)[1]
+        simulated_power = _periodogram(simulated, rate_hz)[1]
+        power_ratios = []
+        log_likelihood = 0.0
+        for band in bands:
+            power = recorded_power[band]
+            drawn = simulated_power[band]
+            power_ratios.append(float(power.sum() / drawn.sum()))
+            if band.any():
+                level = drawn.mean(axis=0)
+                log_likelihood -= float(np.sum(power / level + np.log(level)))
+        log_likelihoods.append(log_likelihood)
+        ratios[f'power_ratio_{label}'] = power_ratios
+        ratios[f'allan_ratio_{label}'] = [
+            rms(allan_deviation(recorded, count) / allan_deviation(simulated, count))
+            for count in counts
         ]
-        recorded, simulated = (_periodogram(v, rate_hz)[1] for v in series)
-        ratios[f'power_ratio_{label}'] = [
-            float(recorded[band].sum() / simulated[band].sum()) for band in bands
-        ]
-        allan = [[allan_deviation(v, round(t * rate_hz)) for v in series] for t in times_s]
-        ratios[f'allan_ratio_{label}'] = [rms(a / b) for a, b in allan]
-        levels = [(recorded[band], simulated[band].mean(axis=0)) for band in bands if band.any()]
-        log_likelihoods.append(
-            -sum(float(np.sum(power / level + np.log(level))) for power, level in levels)
-        )
     return {
         'recording': comparison.name,
         'bands_hz': edges_hz.tolist(),
@@ -639,18 +666,19 @@ def noise_remainders(
     values: dict[tuple[str, str, str], list] = {}
     for c in comparisons if detections else ():
         residual_v = c.residual_v(mean_sensor)
-        signals = [
-            _Series(c.volts, residual_v, bridged(residual_v, c.used)),
-            _simulated(c, named_sensor, seed),
-        ]
+        recording = _Series(c.volts, residual_v, bridged(residual_v, c.used))
+        simulation = _simulated(c, named_sensor, seed)
         for detection in detections:
-            recorded, simulated = (list(_statistics(c, detection, s)) for s in signals)
-            for (quantity, unit, value), (*_, other) in zip(recorded, simulated):
-                values.setdefault((detection.effect, quantity, unit), []).append((value, other))
+            for one, other in zip(
+                _statistics(c, detection, recording), _statistics(c, detection, simulation)
+            ):
+                key = detection.effect, one.quantity, one.unit
+                values.setdefault(key, []).append((one.values, other.values))
     remainders: list[NoiseRemainder] = []
     for key, pairs in values.items():
         recorded, simulated = np.sqrt(np.mean(np.square(np.array(pairs, float)), axis=0))
-        largest, axes = int(np.argmax(recorded)), named_sensor.axes
+        axes = named_sensor.axes
+        largest = int(np.argmax(recorded))
         remainders.append(
             NoiseRemainder(
                 *key,
@@ -673,7 +701,8 @@ class _Series(NamedTuple):
 
 def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Series:
     """Simulate the recording with noise."""
-    at_rate, time_s = replace(sensor, rate_hz=comparison.sensor.rate_hz), comparison.time_s
+    at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
+    time_s = comparison.time_s
     volts = comparison.drawn_v(at_rate, seed)
     # Spikes and repeated samples are left out, as those of the recording are.
     used, _ = repeated_samples(volts, time_s, np.ones(len(volts), bool), at_rate)
@@ -682,33 +711,43 @@ def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Se
     return _Series(volts, residual_v, bridged(residual_v, used))
 
 
+class _Statistic(NamedTuple):
+    """What a noise-like effect shows in one series."""
+
+    quantity: str  # What it is, for people
+    unit: str
+    values: np.ndarray  # By axis, (m,), or of all, (1,)
+
+
 def _statistics(
     comparison: BaselineComparison, detection: Detection, series: _Series
-) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yield quantity, unit and values by axis of what a detection shows, in one series."""
-    volts, residual_v, noise_v = series
-    sensor, time_s, scale = comparison.sensor, comparison.time_s, comparison.scale_v_per_mps2
+) -> Iterator[_Statistic]:
+    """Yield what a detection shows in one series."""
+    sensor = comparison.sensor
+    time_s = comparison.time_s
+    scale = comparison.scale_v_per_mps2
     detector = effect_named(detection.effect).diagnosis.detector
-    finite = np.isfinite(volts).all(axis=1) & (comparison.used | comparison.disturbed)
+    finite = np.isfinite(series.volts).all(axis=1) & (comparison.used | comparison.disturbed)
     if detector is Detector.MAINS_LINE:
-        hz = float(detection.values['frequency_hz'])
-        yield f'line at {hz:.4g} Hz', 'm/s^2', line_amplitude_v(noise_v, time_s, hz) / scale
+        line_hz = float(detection.values['frequency_hz'])
+        amplitude_v = line_amplitude_v(series.noise_v, time_s, line_hz)
+        yield _Statistic(f'line at {line_hz:.4g} Hz', 'm/s^2', amplitude_v / scale)
     elif detector is Detector.NOISE_LEVEL:
-        yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
+        level_v = white_noise_v(series.noise_v, sensor)
+        yield _Statistic('white noise', 'm/s^2', level_v / scale)
     elif detector is Detector.ISOLATED_SAMPLES:
-        spikes = isolated_samples(volts, residual_v, time_s, finite, sensor)[1]
-        values = (
-            spikes[0].values
-            if spikes
-            else {'rate_hz': np.zeros(1), 'amplitude_v': np.zeros(len(scale))}
-        )
-        yield 'spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz'])
-        yield 'size of a spike', 'm/s^2', values['amplitude_v'] / scale
+        _, found = isolated_samples(series.volts, series.residual_v, time_s, finite, sensor)
+        values = {'rate_hz': np.zeros(1), 'amplitude_v': np.zeros(len(scale))}
+        if found:
+            values = found[0].values
+        yield _Statistic('spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz']))
+        yield _Statistic('size of a spike', 'm/s^2', values['amplitude_v'] / scale)
     elif detector is Detector.REPEATED_SAMPLES:
-        used = repeated_samples(volts, time_s, finite, sensor)[0]
-        yield 'share of repeated samples', '1', np.array([float(np.mean(~used[finite]))])
+        used, _ = repeated_samples(series.volts, time_s, finite, sensor)
+        share = np.array([float(np.mean(~used[finite]))])
+        yield _Statistic('share of repeated samples', '1', share)
     elif detector is Detector.COARSE_CODES:
-        yield 'distance of codes', 'm/s^2', code_step_v(volts) / scale
+        yield _Statistic('distance of codes', 'm/s^2', code_step_v(series.volts) / scale)
 
 
 def floor_without(

@@ -12,16 +12,18 @@ from __future__ import annotations
 
 from adxl_ros.diagnose.comparison import BaselineComparison, bridged
 from adxl_ros.diagnose.data_faults import DataFault
-from adxl_ros.diagnose.motion_shifts import CORRELATED, correlations
+from adxl_ros.diagnose.motion_shifts import correlate, CORRELATED
 from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg_text
-from adxl_ros.signals import gravity_at_rest
+from adxl_ros.signals import gravity_at_rest, tolerances
 from adxl_ros.signals.block_statistics import rms
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
-from adxl_ros.signals.rest_detection import find_rests, rest_means
+from adxl_ros.signals.rest_detection import find_rests
+from adxl_ros.signals.rest_means import rest_means
+from adxl_ros.signals.rest_search import RestRule
 from adxl_ros.simulate.motion import ForcePath
 import numpy as np
 import scipy
@@ -62,17 +64,17 @@ def check_stated_gravity(force: ForcePath, sensor: Sensor) -> None:
     time_s = force.time_s
     force_mps2 = np.column_stack(force(time_s))
     rate_hz = stamped_rate_hz(time_s)
-    rests = find_rests(time_s, force_mps2, rate_hz, gravity=G0_MPS2)
+    rests = find_rests(time_s, force_mps2, rate_hz, RestRule(gravity=G0_MPS2))
     axes = force_mps2.shape[1]
     shape = len(rests), axes
     mean, std = rest_means(time_s, force_mps2, rests, rate_hz)
     readings = RestReadings(np.reshape(mean, shape), np.reshape(std, shape))
     gravity_mps2 = sensor.local_gravity_mps2
-    fault = gravity_at_rest.look(readings, gravity_at_rest.IDEAL, gravity_mps2).fault
+    fault = gravity_at_rest.look(readings, tolerances.IDEAL, gravity_mps2).fault
     if fault is not None and fault.is_clear:
         text = fault.stated_by(option(sim_unit=fault.symbol))
         raise DataFault(fault.data_fault, f'{force.name}: {text}')
-    tolerance = gravity_at_rest.nominal_tolerance(sensor).widest(axes)
+    tolerance = tolerances.nominal_tolerance(sensor).widest(axes)
     fault = gravity_at_rest.look(readings, tolerance, gravity_mps2).fault
     if fault is not None and fault.kind is GravityFaultKind.SCALE:
         raise DataFault(
@@ -116,12 +118,12 @@ def check_rest(comparison: BaselineComparison) -> None:
 
 def check_delay(simulated_g: np.ndarray, measured_g: np.ndarray, rate_hz: float) -> None:
     """Refuse a sensor that is later or earlier than its reference than a latency explains."""
-    found = correlations(simulated_g, measured_g, 2 * len(simulated_g) // 3)
-    is_searched = np.abs(found.lags) <= LARGEST_DELAY_S * rate_hz
+    found = correlate(simulated_g, measured_g, 1 / rate_hz, 2 * len(simulated_g) // 3)
+    is_searched = np.abs(found.lags_s) <= LARGEST_DELAY_S
     by_lag = np.where(is_searched, found.correlation, -1.0)
     best = int(np.argmax(by_lag))
-    delay_s = found.lags[best] / rate_hz
-    undelayed = by_lag[found.lags == 0][0]
+    delay_s = found.lags_s[best]
+    undelayed = by_lag[found.lags_s == 0][0]
     is_clear = by_lag[best] > max(CORRELATED, undelayed + _CORRELATION_GAIN)
     if is_clear and abs(delay_s) > _SEARCHED_DELAY_S:
         raise DataFault(

@@ -48,6 +48,7 @@ LARGEST_SET = 3  # Largest number of effects in a set. Chosen: one recording har
 _SINGLES = 8  # Singles whose pairs are ranked. Chosen: run time
 _FITTED_SINGLES = 5  # Singles that are fitted. Chosen: run time
 _FURTHER = 3  # Further effects that are fitted beside the best set, and pairs. Chosen: run time
+_EXCHANGED = 2  # Singles that take the place of the best one in a pair. Chosen: run time
 _COMPLETED = 4  # Sets that are fitted without each of their effects. Chosen: run time
 _IMMATERIAL = 0.01
 """Share of the gain of a set that a further effect must gain, so that a third one is looked for.
@@ -91,8 +92,17 @@ class Hypothesis:
 
     @property
     def sizeless(self) -> frozenset[str]:
-        """Effects whose determined sizes all agree with the baseline, by 90 % intervals."""
-        differs = np.abs(self.values) > Z_90 * self.std
+        """
+        Effects whose determined sizes all agree with the baseline, by 90 % intervals.
+
+        The intervals are those at the fitted shapes: without a size a shape has no meaning.
+        """
+        covariance = self.fit.covariance
+        shapes = [i for i, name in enumerate(self.names) if not parameter_of(name).is_size]
+        by_shapes = covariance[: len(self.names), shapes]
+        known = np.linalg.solve(covariance[np.ix_(shapes, shapes)], by_shapes.T)
+        variance = self.std**2 - np.einsum('ij,ji->i', by_shapes, known)
+        differs = self.values**2 > Z_90**2 * np.maximum(variance, 0.0)
         sized = set[str]()
         differing = set[str]()
         for name, shows, is_open in zip(self.names, differs, self.undetermined):
@@ -423,27 +433,41 @@ class Search:
             gained = best.log_evidence - self.model.null_fit.log_evidence
             if self.best.log_evidence - best.log_evidence < _IMMATERIAL * gained:
                 break
-        # Zero-g and scale factor of a unit are rarely exact, and may hide behind another effect.
-        singles_found = [h for h in self.found.values() if len(h.effects) == 1]
-        best_single = max(singles_found, key=lambda h: h.log_evidence, default=self.best)
-        for beside in (self.best, best_single):
-            self._add_straight(beside, [variants[i].effect for i in straight])
+        # What zero-g and scale factor of a unit imitate gains little, and may hide behind others.
+        shown = dict.fromkeys(effect_named(variants[i].effect) for i in identifiable)
+        hidden = [e.name for e in shown if e.diagnosis.straight_line or e.diagnosis.imitated]
+        for beside in (self.best, *self._of_size(1)[:1]):
+            self._add_each(beside, hidden)
         show_share(0.8)
         leading = sorted(ranked.chosen[0] for ranked in singles[:_SINGLES])
         pairs = self._rank(self.model, (), list(combinations(leading, 2)))
         for pair in pairs[:_FURTHER]:
             if pair.gain > (1 + _IMMATERIAL) * singles[0].gain:
                 self._fit(self.model, pair)
+        self._exchange()
         for hypothesis in sorted(self.found.values(), key=lambda h: -h.log_evidence)[:_COMPLETED]:
             self._complete(hypothesis.effects)
         show_share(1.0)
 
-    def _add_straight(self, beside: Hypothesis, straight: Sequence[str]) -> None:
-        """Fit zero-g and scale factor beside a set."""
+    def _of_size(self, count: int) -> list[Hypothesis]:
+        """Return the sets of so many effects, by falling log evidence."""
+        sets = [h for h in self.found.values() if len(h.effects) == count]
+        return sorted(sets, key=lambda h: -h.log_evidence)
+
+    def _exchange(self) -> None:
+        """Fit the further effect of the best pair beside other singles than the best."""
+        singles = self._of_size(1)
+        best = frozenset(singles[0].effects) if singles else frozenset()
+        further = [{*h.effects} - best for h in self._of_size(2)]
+        for single in singles[1 : 1 + _EXCHANGED]:
+            self._add_each(single, [*chain(*(e for e in further if len(e) == 1))][:1])
+
+    def _add_each(self, beside: Hypothesis, further: Sequence[str]) -> None:
+        """Fit each of further effects beside a set."""
         if not 0 < len(beside.effects) < LARGEST_SET:
             return
         start = dict(zip(beside.names, beside.values))
-        for effect in dict.fromkeys(straight):
+        for effect in further:
             effects = (*beside.effects, effect)
             if effect not in beside.effects and frozenset(effects) not in self.found:
                 self._add(effects, start, {})

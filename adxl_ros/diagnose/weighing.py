@@ -4,7 +4,8 @@ The rules that weigh sets of effects by their held-out figures.
 
 Explained power P is by how much a set of effects lowers the held-out mean square. A set is a
 candidate where each of its effects is needed: without it materially less is explained, and the
-samples are less probable. The same rules weigh all blocks and each draw of them.
+samples are less probable, also where the form of the other effects may err. The same rules weigh
+all blocks and each draw of them.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ if TYPE_CHECKING:
 
 HEALTHY = ''  # The drift of a healthy unit's noise
 _SHARE_OF_SET = 0.03
-"""Share of the explained power that each effect of a set must hold. Chosen: a sixth of the
+"""Share of the explained power that a drift beside exact effects must hold. Chosen: a sixth of the
 amplitude."""
 SHARE_OF_FORM = 0.1
-"""The same beside an effect whose form is not exact over the same variables. Chosen: a third of
-the amplitude, because what such a form leaves may look like an effect."""
+"""Share of the explained power that no error of form holds. Chosen: a third of the amplitude,
+three standard deviations of such an error."""
 _FORM_AT_REST = SHARE_OF_FORM**2
 """Share of the explained power by which a set may make rests worse: a tenth of its amplitude may
 be an error of its form."""
@@ -163,10 +164,28 @@ class Evidence:
         healthy = fits[HEALTHY].figures
         return self.weights @ (drifting.log_likelihood - healthy.log_likelihood)
 
+    def is_beyond_form(self, effects: frozenset[str], others: frozenset[str]) -> bool:
+        """Determine whether a set explains materially more than others with errors of form."""
+        # No error of form holds a tenth of the power, and most effects of a set hold more.
+        explained = float(self.gain(effects, NOTHING)[0])
+        if float(self.gain(effects, others)[0]) > SHARE_OF_FORM * explained:
+            return True
+        # A weak effect that all blocks do not show is not looked for in draws of them.
+        if self.is_draw and others not in self._fits(effects).beside_errors:
+            return False
+        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
+        gained = self.figure(self.weights @ (more.log_likelihood - less.log_likelihood))
+        lost = float(self.mean(less.squares - more.squares)[0])
+        return gained.predicts and lost > self.material_mps2**2
+
+    def _fits(self, effects: frozenset[str]) -> HeldOutFits:
+        """Return the fits of a set in the present noise, or in healthy noise without it."""
+        fits = self.candidates[effects]
+        return fits[self.noise if self.noise in fits else HEALTHY]
+
     def _figures(self, effects: frozenset[str]) -> HeldOut:
         """Return the figures of a set in the present noise, or in healthy noise without it."""
-        fits = self.candidates[effects]
-        return fits[self.noise if self.noise in fits else HEALTHY].figures
+        return self._fits(effects).figures
 
     def interval(self, draws: np.ndarray) -> Interval:
         """Return the value of all blocks with the interval of the draws."""
@@ -174,29 +193,23 @@ class Evidence:
         return Interval(float(draws[0]), float(min(low, draws[0])), float(max(high, draws[0])))
 
 
-def is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
+def _is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
     """Determine whether a set loses a material part of what it explains without an effect."""
-    if effect in evidence.sizeless.get(effects, ()):
-        return False
     others = effects - {effect}
+    if effect in evidence.sizeless.get(effects, ()) or others not in evidence.candidates:
+        return False
     lost = evidence.figure(evidence.gain(effects, others))
     nats = evidence.figure(evidence.nats(effects, others))
+    proof = {*effect_named(effect).diagnosis.proof}
+    by_pose = bool(proof) and proof <= _SHOWN_BY_POSE
     is_certain = nats.value > _NATS and max(nats.low, lost.low) > 0
-    if not is_certain:
-        return False
-    hints = effect_named(effect).diagnosis
-    # An error of form of another effect may look like an effect over the same variables.
-    shares_form = any({*hints.form} & {*effect_named(e).diagnosis.form} for e in others)
-    share = SHARE_OF_FORM if shares_form else _SHARE_OF_SET
-    explained = float(evidence.gain(effects, NOTHING)[0])
-    by_pose = bool(hints.proof) and {*hints.proof} <= _SHOWN_BY_POSE
-    return lost.value > max(evidence.material_power(float(by_pose)), share * explained)
+    return is_certain and lost.value > evidence.material_power(float(by_pose))
 
 
 def _is_minimal(evidence: Evidence, effects: frozenset[str]) -> bool:
-    """Determine whether all effects of a set are needed."""
-    return all(
-        effects - {e} in evidence.candidates and is_needed(evidence, effects, e) for e in effects
+    """Determine whether all effects of a set are needed, beyond errors of form of the others."""
+    return all(_is_needed(evidence, effects, e) for e in effects) and all(
+        evidence.is_beyond_form(effects, effects - {e}) for e in effects
     )
 
 

@@ -23,6 +23,14 @@ from adxl_ros.process import option
 
 AnyPath = str | os.PathLike  # A path, as the functions of Python take it
 _SUFFIX = '.part'  # End of the names of directories in which new files are written
+_AT_FDCWD = -100  # Of renameat2: paths are those of this process
+_RENAME_EXCHANGE = 2  # Of renameat2: swap both names
+_MARK = 'user.adxl_ros.written'
+"""Extended attribute of what this package wrote: the time of the last change, ns, as text."""
+_BAG_FILES = ('*.mcap', '*.db3', 'metadata.yaml')  # Names of the files in a bag
+_KEPT_BYTES = 256 << 20
+"""Part of a file that stays in the cache for whoever reads it next: a recording of an hour at 1
+kHz is smaller, and every computer has so much to spare."""
 
 
 @contextmanager
@@ -63,10 +71,6 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-_AT_FDCWD = -100  # Of renameat2: paths are those of this process
-_RENAME_EXCHANGE = 2  # Of renameat2: swap both names
-
-
 def _exchange(fresh: Path, target: Path) -> None:
     """
     Swap two directories, of which none can be renamed over the other.
@@ -84,10 +88,6 @@ def _exchange(fresh: Path, target: Path) -> None:
     if failed:
         os.replace(target, fresh.with_name('old'))
         os.replace(fresh, target)
-
-
-_MARK = 'user.adxl_ros.written'
-"""Extended attribute of what this package wrote: the time of the last change, ns, as text."""
 
 
 def _mark(path: Path) -> None:
@@ -108,9 +108,6 @@ def is_own(path: AnyPath) -> bool:
         return False
 
 
-_BAG_FILES = ('*.mcap', '*.db3', 'metadata.yaml')  # Names of the files in a bag
-
-
 def _refuse_folder_of_others(path: Path) -> None:
     """Refuse to replace a folder that holds anything but a bag, unless this package wrote it."""
     if not path.is_dir() or is_own(path):
@@ -127,8 +124,10 @@ def _refuse_folder_of_others(path: Path) -> None:
 def require_own(path: AnyPath, may_overwrite: bool = False) -> None:
     """Refuse to replace what others wrote or changed, unless the user permits it."""
     target = Path(path)
+    if may_overwrite or not target.exists():
+        return
     is_empty_folder = target.is_dir() and not any(target.iterdir())
-    if target.exists() and not (may_overwrite or is_own(target) or is_empty_folder):
+    if not (is_empty_folder or is_own(target)):
         raise UserError(
             f'{path}: is there already, and was not written by this package, or was changed '
             f'since; choose another name, or replace it with {option(overwrite=True)}'
@@ -215,11 +214,6 @@ def append_line(file: FileIO, line: str) -> None:
         with suppress(OSError):
             file.truncate(size)
         raise
-
-
-_KEPT_BYTES = 256 << 20
-"""Part of a file that stays in the cache for whoever reads it next: a recording of an hour at 1
-kHz is smaller, and every computer has so much to spare."""
 
 
 def release_written(file: BinaryIO) -> None:

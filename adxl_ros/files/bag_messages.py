@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.atomic_write import AnyPath
-from adxl_ros.files.recording_columns import NOMINAL_KEYS
+from adxl_ros.files.stream_info import NOMINAL_KEYS
 from adxl_ros.model.constants import MEASURED_AXES
 from adxl_ros.process import option
 import numpy as np
@@ -61,6 +61,13 @@ _PIECE_MESSAGES = 4096  # Messages that are collected to a piece (chosen: some M
 
 Raws = Sequence[bytes] | np.ndarray
 """Messages of one type: their bytes one by one, or as rows of equal length, (n, size)."""
+_MAGIC = b'\x89MCAP0\r\n'  # First and last bytes of a whole file (specification, "Magic")
+_ENDINGS = ('.mcap', '.db3')  # Ends of the names of files in a recording's directory
+IMU = 'sensor_msgs/msg/Imu'
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+TEMPERATURE = 'sensor_msgs/msg/Temperature'
+BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
+DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'  # Type of `sensor_info`
 
 
 @dataclass(frozen=True)
@@ -240,9 +247,6 @@ def _write_indices(storage: Any, indices: Mapping[int, bytes]) -> None:
     )
 
 
-_MAGIC = b'\x89MCAP0\r\n'  # First and last bytes of a whole file (specification, "Magic")
-
-
 def _is_unfinished(path: Path) -> bool:
     """Return whether an MCAP file has no end, because its recorder was killed, or still runs."""
     with open(path, 'rb') as file:
@@ -268,9 +272,6 @@ def _open_unfinished(path: Path) -> tuple[Any, str]:
     counts = reader.statistics.channel_message_counts if reader.statistics else {}
     reader.connections = [each._replace(msgcount=counts[each.id]) for each in reader.connections]
     return reader, f'{path}: cut off at byte {reader.data_end} of {size}'
-
-
-_ENDINGS = ('.mcap', '.db3')  # Ends of the names of files in a recording's directory
 
 
 class Bag:
@@ -318,6 +319,7 @@ class Bag:
             yield from map(bytes, piece.messages[topic])
 
     def _messages(self, storage: Any, connections: list[Any]) -> Iterator[tuple[str, bytes, int]]:
+        """Yield topic, CDR and log time, ns, of the messages of some connections."""
         if self._is_packed:
             from backports import zstd
         # Without an index, rosbags would demand the messages in the order of time.
@@ -389,13 +391,6 @@ def _files(path: Path) -> list[Path]:
     return sorted(files, key=lambda file: (len(file.name), file.name))  # 10 comes behind 9
 
 
-IMU = 'sensor_msgs/msg/Imu'
-JOINT_STATE = 'sensor_msgs/msg/JointState'
-TEMPERATURE = 'sensor_msgs/msg/Temperature'
-BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
-DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'  # Type of `sensor_info`
-
-
 class Topics(NamedTuple):
     """Full names of the topics in a bag; None where the bag does not hold it."""
 
@@ -430,7 +425,8 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
     )
     info = beside('sensor_info', DIAGNOSTIC_STATUS)
     # With several sensors, the only sensor_info may be that of another one.
-    if info is None and (is_own or [kind for _, kind in bag.types].count(IMU) == 1):
+    is_alone = is_own or [kind for _, kind in bag.types].count(IMU) == 1
+    if info is None and is_alone:
         info = _only(bag, 'sensor_info', DIAGNOSTIC_STATUS)
     space = joints.removesuffix('joint_states') if joints else f'{space}stage/'
     return Topics(

@@ -37,12 +37,10 @@ from adxl_ros.files.recording_columns import (
     JOINTS,
     LIMIT,
     limits,
-    LONGEST_MOVE_NS,
     Recording,
-    seconds,
-    StampCheck,
-    Track,
 )
+from adxl_ros.files.reference_track import LONGEST_MOVE_NS, seconds, Track
+from adxl_ros.files.stamp_check import StampCheck
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.process import option
 import numpy as np
@@ -187,6 +185,7 @@ class _WaitingSamples:
         )
 
     def _begin(self, first: Raws, stamp_ns: int) -> None:
+        """Take origin, axes and gyroscope of the first message."""
         self._first_ns = stamp_ns
         if stamp_ns > _EXACT_NS:
             self.epoch_ns = stamp_ns // 1_000_000_000 * 1_000_000_000
@@ -268,28 +267,37 @@ def positions(
 
 def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
     """Return the references by column; none of a joint without a position."""
-    tracks: dict[str, Track] = {}
-    if topics.joints:
-        values = partial(positions, names=JOINTS)
-        found = series(bag, topics.joints, cdr.joint_state, values)
-        tracks |= _tracks_of(f'{bag.path}: topic {topics.joints}', found, LONGEST_MOVE_NS)
-    if topics.temperature:
-        values = partial(_first, column='temperature_c', field='temperature')
-        found = series(bag, topics.temperature, cdr.temperature, values)
-        tracks |= _tracks_of(f'{bag.path}: topic {topics.temperature}', found)
-    if topics.supply:
-        values = partial(_first, column='supply_v', field='voltage')
-        found = series(bag, topics.supply, cdr.battery_state, values)
-        tracks |= _tracks_of(f'{bag.path}: topic {topics.supply}', found)
-    return tracks
+
+    def of_topic(
+        topic: str | None,
+        find: Callable[[bytes], cdr.Layout],
+        values: Values,
+        longest_ns: float = np.inf,
+    ) -> dict[str, Track]:
+        """Return the references of a topic, if there is one."""
+        if topic is None:
+            return {}
+        where = f'{bag.path}: topic {topic}'
+        return _tracks_of(where, series(bag, topic, find, values), longest_ns)
+
+    return {
+        **of_topic(
+            topics.joints, cdr.joint_state, partial(positions, names=JOINTS), LONGEST_MOVE_NS
+        ),
+        **of_topic(
+            topics.temperature,
+            cdr.temperature,
+            lambda table: {'temperature_c': table.numbers('temperature')[:, 0]},
+        ),
+        **of_topic(
+            topics.supply,
+            cdr.battery_state,
+            lambda table: {'supply_v': table.numbers('voltage')[:, 0]},
+        ),
+    }
 
 
-def _first(table: cdr.MessageTable, column: str, field: str) -> dict[str, np.ndarray]:
-    """Return the first number of a field as a column."""
-    return {column: table.numbers(field)[:, 0]}
-
-
-def _tracks_of(where: str, found: Series, longest_ns: float = np.inf) -> dict[str, Track]:
+def _tracks_of(where: str, found: Series, longest_ns: float) -> dict[str, Track]:
     """Return the references of a topic by column; refuse values that none has."""
     tracks = {}
     for name, value in found.columns.items():

@@ -26,7 +26,8 @@ from adxl_ros.files.bag_messages import (
     write_messages,
 )
 from adxl_ros.files.column_mapping import Columns
-from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
+from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
+from adxl_ros.files.stream_info import converted_info
 from adxl_ros.files.tables import TABLE_ENDINGS
 from adxl_ros.model.covariance import imu_covariance, NOT_MEASURED
 from adxl_ros.model.sensor import Sensor
@@ -38,6 +39,16 @@ _ROWS_AT_ONCE = 65536  # Samples that are made into messages at a time (chosen: 
 _END_OF_TIME_NS = (1 << 31) * 1_000_000_000
 """First stamp that is too late, ns: builtin_interfaces/Time has 32 bits of signed seconds."""
 _LONGEST_NS = (1 << 63) - 1  # Largest duration of ROS, ns: a QoS without a deadline
+_OTHER_FORMATS = {
+    *TABLE_ENDINGS,
+    *('.csv', '.tsv', '.txt', '.json', '.yaml', '.xlsx', '.h5', '.feather', '.npy', '.pkl'),
+    *('.mcap', '.db3', '.bag'),
+}
+"""Ends of the names of files, in lower case, that are no bags or only read."""
+_VOLTAGE = np.array([0.0, *[np.nan] * 6], np.float32)
+"""Voltage of a battery; temperature, current, charge, capacities and percentage are unknown."""
+_FLUSH_NS = 500_000_000
+"""Time after which messages are written to the file, ns. Chosen: what a kill loses."""
 
 
 class TopicForm(NamedTuple):
@@ -84,14 +95,6 @@ class _NewBag:
             )
         write_messages(self.writer, batches)
         release_written(self.writer.storage.bio)
-
-
-_OTHER_FORMATS = {
-    *TABLE_ENDINGS,
-    *('.csv', '.tsv', '.txt', '.json', '.yaml', '.xlsx', '.h5', '.feather', '.npy', '.pkl'),
-    *('.mcap', '.db3', '.bag'),
-}
-"""Ends of the names of files, in lower case, that are no bags or only read."""
 
 
 def _check_ending(path: Path) -> None:
@@ -274,9 +277,6 @@ def _imu_form(covariance: np.ndarray) -> TopicForm:
     )
 
 
-_VOLTAGE = np.array([0.0, *[np.nan] * 6], np.float32)
-"""Voltage of a battery; temperature, current, charge, capacities and percentage are unknown."""
-
 _SCALARS = {
     'temperature_c': (
         '/temperature',
@@ -329,10 +329,6 @@ def tilt_bag(path: AnyPath) -> Iterator[Callable[..., None]]:
                 )
 
         yield append
-
-
-_FLUSH_NS = 500_000_000
-"""Time after which messages are written to the file, ns. Chosen: what a kill loses."""
 
 
 class LiveBag:

@@ -25,7 +25,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.files.parameter_file import compose
-from adxl_ros.files.recording_columns import NO_SERIAL
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.model.population import PooledCoefficient, Population
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command, package_version
@@ -39,6 +39,14 @@ _MAX_NAME = 120
 """Characters of a serial number in a file name (chosen: file systems permit 255 bytes)."""
 _HASH_DIGITS = 8
 """Digits of the data's SHA-256 in an id (chosen: enough for calibrations of one second)."""
+FORMAT = 1  # Version of the format. A file of another version is refused
+_DIGITS = 9  # Significant digits of the values (chosen: far below any uncertainty)
+_HEAD = """\
+# Mean and spread of each coefficient over the units of a fleet, written by fleet.
+# prediction_std is the standard deviation of a further unit about the mean.
+# Use it: {command}
+"""
+"""Comments at the begin of the file."""
 
 
 class StoredCalibration(NamedTuple):
@@ -197,16 +205,6 @@ def sha256(paths: Sequence[AnyPath]) -> str:
     )
 
 
-FORMAT = 1  # Version of the format. A file of another version is refused
-_DIGITS = 9  # Significant digits of the values (chosen: far below any uncertainty)
-_HEAD = """\
-# Mean and spread of each coefficient over the units of a fleet, written by fleet.
-# prediction_std is the standard deviation of a further unit about the mean.
-# Use it: {command}
-"""
-"""Comments at the begin of the file."""
-
-
 def write_population(path: AnyPath, population: Population) -> None:
     """Write a population."""
     contents = {
@@ -229,16 +227,14 @@ def read_population(path: AnyPath) -> Population:
     """Read and check a population."""
     node = compose(path)
     contents = yaml.constructor.SafeConstructor().construct_document(node) if node else None
-    if (
-        not isinstance(contents, dict)
-        or contents.get('format') != FORMAT
-        or not isinstance(contents.get('coefficients'), dict)
-    ):
+    keys = contents if isinstance(contents, dict) else {}
+    coefficients = keys.get('coefficients')
+    if keys.get('format') != FORMAT or not isinstance(coefficients, dict):
         raise UserError(
             f'{path}: no population of format {FORMAT}; give the population.yaml that fleet writes'
         )
     pooled = {}
-    for name, values in contents['coefficients'].items():
+    for name, values in coefficients.items():
         try:
             pooled[str(name)] = PooledCoefficient(**values)
             is_right = all(map(math.isfinite, values.values())) and values['prediction_std'] > 0

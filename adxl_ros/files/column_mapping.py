@@ -27,6 +27,46 @@ _ENTRY = re.compile(
 
 
 Columns = Mapping[str, np.ndarray]  # Arrays (n,) by the name of their column or field
+_TILT = {'roll', 'pitch'}  # Roles of the angles of an inclinometer
+GYRO_ROLES = ('gx', 'gy', 'gz')  # Roles of the axes of a gyroscope
+LSB = 'lsb'  # Unit of counts, which needs the counts of 1 g
+UNSIGNED = 'u16'  # Unit of counts that lost their sign, so that 65535 is −1
+_SPELLINGS = {
+    's': 'sec secs second seconds',
+    'ms': 'msec millis milliseconds',
+    'us': 'µs μs usec micros microseconds',
+    'ns': 'nsec nanoseconds',
+    'epoch': 'unix posix',
+    'mps2': 'm/s^2 m/s² m/s2 ms2 ms^2 m/s/s ms-2 ms^-2 m_s2 mss m·s⁻² m.s-2 m_s^-2 m_s-2',
+    'mmps2': 'mm/s^2 mm/s² mm/s2 mms2 mm/s/s mms-2 mm_s2',
+    'mg': 'millig',
+    'g': 'gs',
+    LSB: 'counts count raw digits',
+    'v': 'volt volts',
+    'mv': 'millivolt millivolts',
+    'deg': '° degree degrees',
+    'rad': 'radian radians',
+    'radps': 'rad/s rad_s rad_per_s rad·s⁻¹ rad.s-1',
+    'dps': 'deg/s °/s deg_s degps deg_per_s',
+    'mdps': 'mdeg/s m°/s',
+    'c': '°c degc celsius deg_c',
+    'f': '°f degf fahrenheit',
+    'k': 'kelvin',
+}
+_ALIASES: dict[str, str] = {}
+for _name, _words in _SPELLINGS.items():
+    _ALIASES |= dict.fromkeys(_words.split(), _name)
+"""Names of units by their other spellings, in lower case, with _ for a blank."""
+_BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')
+"""A part of a column's name in brackets."""
+_WORD_ENDS = re.compile(r'[_\s.]+|\[\d+\]|[(\[{].*[)\]}]|(?<=[a-z])(?=[A-Z])')
+"""Ends of the words in a column's name; an index or a part in brackets is none."""
+_LISTED_NAMES = 12
+"""Largest number of columns that a message names (chosen: some lines of a terminal)."""
+_NEAR = 0.25
+"""Largest logarithm of the ratio of a length to gravity (chosen: above bias and scale errors)."""
+_SHORTEST_STEP_S = 2.5e-5  # Shortest step of stamps, s. Chosen: an IIS3DWB has steps of 3.75e-5 s
+_LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, with jitter
 
 
 @dataclass(frozen=True)
@@ -39,6 +79,18 @@ class TableBlock:
     info: Mapping[str, str] = field(default_factory=dict)  # Keys and values that the file states
     done: float = 1.0  # Fraction of the file that has been read at the end of the rows
     cut: str = ''  # Where a damaged file ends; empty if it is whole
+
+    def refuse(
+        self, column: str, wrong: np.ndarray, reason: str, reason_of_none: str = ''
+    ) -> None:
+        """Refuse cells of a column, (n,): for a reason, or another one where they are empty."""
+        if wrong.any():
+            row = int(wrong.argmax())
+            value = self.columns[column][row]
+            text = f'{value:g}, {reason}; delete the line, or correct the unit'
+            if np.isnan(value):
+                text = f'empty or NaN; {reason_of_none}'
+            raise UserError(f'{self.where(row, column)} is {text}')
 
 
 @dataclass(frozen=True)
@@ -139,24 +191,29 @@ def parse_mapping(text: str) -> ColumnMapping:
                 'colon'
             )
         sources[role] = Source(column, name)
-    axes = ''.join(axis for axis in AXES if axis in sources)
+    _require_whole_groups(where, sources)
+    return ColumnMapping(sources, where)
+
+
+def _require_whole_groups(where: str, roles: Collection[str]) -> None:
+    """Refuse axes, gyroscopes and tilts of which a part is named."""
+    axes = ''.join(axis for axis in AXES if axis in roles)
     if axes not in MEASURED_AXES:
         raise UserError(
             f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
             f'and z; write for example {_EXAMPLE}'
         )
-    turns = [role for role in GYRO_ROLES if role in sources]
+    turns = [role for role in GYRO_ROLES if role in roles]
     if len(turns) not in (0, len(GYRO_ROLES)):
         raise UserError(
             f'{where}: names {", ".join(turns)} of a gyroscope; name {", ".join(GYRO_ROLES)}'
         )
-    given = {'roll', 'pitch', 'alpha', 'beta'} & set(sources)
-    if given & {'roll', 'pitch'} and given != {'roll', 'pitch'}:
+    angles = {'roll', 'pitch', 'alpha', 'beta'} & set(roles)
+    if not angles.isdisjoint(_TILT) and angles != _TILT:
         raise UserError(
-            f'{where}: {", ".join(sorted(given))} are no reference; name roll and '
+            f'{where}: {", ".join(sorted(angles))} are no reference; name roll and '
             'pitch, or alpha and beta'
         )
-    return ColumnMapping(sources, where)
 
 
 SignedAxes = tuple[tuple[int, int], ...]
@@ -203,8 +260,6 @@ class Quantity(Enum):
     TURN = 'radps'
 
 
-GYRO_ROLES = ('gx', 'gy', 'gz')  # Roles of the axes of a gyroscope
-
 ROLES: Mapping[str, Quantity] = {
     'time': Quantity.TIME,
     **dict.fromkeys(AXES, Quantity.OUTPUT),
@@ -215,9 +270,6 @@ ROLES: Mapping[str, Quantity] = {
     **dict.fromkeys(GYRO_ROLES, Quantity.TURN),
 }
 """Quantity of each role that a column can have."""
-
-LSB = 'lsb'  # Unit of counts, which needs the counts of 1 g
-UNSIGNED = 'u16'  # Unit of counts that lost their sign, so that 65535 is −1
 
 
 def signed(values: np.ndarray) -> np.ndarray:
@@ -283,39 +335,6 @@ GRAVITY = {
 }
 """Length of gravity in each unit of acceleration."""
 
-_SPELLINGS = {
-    's': 'sec secs second seconds',
-    'ms': 'msec millis milliseconds',
-    'us': 'µs μs usec micros microseconds',
-    'ns': 'nsec nanoseconds',
-    'epoch': 'unix posix',
-    'mps2': 'm/s^2 m/s² m/s2 ms2 ms^2 m/s/s ms-2 ms^-2 m_s2 mss m·s⁻² m.s-2 m_s^-2 m_s-2',
-    'mmps2': 'mm/s^2 mm/s² mm/s2 mms2 mm/s/s mms-2 mm_s2',
-    'mg': 'millig',
-    'g': 'gs',
-    LSB: 'counts count raw digits',
-    'v': 'volt volts',
-    'mv': 'millivolt millivolts',
-    'deg': '° degree degrees',
-    'rad': 'radian radians',
-    'radps': 'rad/s rad_s rad_per_s rad·s⁻¹ rad.s-1',
-    'dps': 'deg/s °/s deg_s degps deg_per_s',
-    'mdps': 'mdeg/s m°/s',
-    'c': '°c degc celsius deg_c',
-    'f': '°f degf fahrenheit',
-    'k': 'kelvin',
-}
-_ALIASES: dict[str, str] = {}
-for _name, _words in _SPELLINGS.items():
-    _ALIASES |= dict.fromkeys(_words.split(), _name)
-"""Names of units by their other spellings, in lower case, with _ for a blank."""
-
-_BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')
-"""A part of a column's name in brackets."""
-
-_WORD_ENDS = re.compile(r'[_\s.]+|\[\d+\]|[(\[{].*[)\]}]|(?<=[a-z])(?=[A-Z])')
-"""Ends of the words in a column's name; an index or a part in brackets is none."""
-
 
 def unit_name(text: str, quantity: Quantity) -> str | None:
     """Return the name of a unit that is written in any way."""
@@ -376,7 +395,8 @@ class ReadingOptions:
                 f'{where}: {counts[0]} is in LSB; add {option("lsb_per_g")} with the counts of '
                 '1 g, as in the datasheet'
             )
-        if not counts and (self.lsb_per_g or self.lsb_at_0g):
+        is_stated = bool(self.lsb_per_g or self.lsb_at_0g)
+        if is_stated and not counts:
             raise UserError(
                 f'{option("lsb_per_g")}: no column is in LSB; add {option(unit=LSB)}, or leave '
                 f'{option("lsb_per_g")} and {option("lsb_at_0g")} out'
@@ -403,14 +423,6 @@ class ReadingOptions:
 
 
 AS_IT_IS = ReadingOptions()
-
-
-_LISTED_NAMES = 12
-"""Largest number of columns that a message names (chosen: some lines of a terminal)."""
-_NEAR = 0.25
-"""Largest logarithm of the ratio of a length to gravity (chosen: above bias and scale errors)."""
-_SHORTEST_STEP_S = 2.5e-5  # Shortest step of stamps, s. Chosen: an IIS3DWB has steps of 3.75e-5 s
-_LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, with jitter
 
 
 def first_names(names: Sequence[str]) -> str:
@@ -452,8 +464,10 @@ def parse_unit(
     text: str, argument: str = 'unit', known: Iterable[str] = UNITS[Quantity.OUTPUT]
 ) -> str:
     """Return the name of a unit of the sensor's output, one of the known; '' for no text."""
-    name = unit_name(text, Quantity.OUTPUT) if text else ''
-    if name is None or (name and name not in known):
+    if not text:
+        return ''
+    name = unit_name(text, Quantity.OUTPUT)
+    if name is None or name not in known:
         raise UserError(
             f'{option(**{argument: text})}: unknown unit; write one of {", ".join(known)}'
         )

@@ -104,9 +104,9 @@ def read_blocks(
             first = last + len(preamble) + 1
             last = first - 1 + data.count(b'\n')
             numbers: Sequence[int] = range(first, last + 1)
-            marks = data.translate(None, _NO_MARKS)
             # An empty line, or one field, follows the end of a line.
-            if b'#' in marks or b'\n\n' in marks or marks.startswith(b'\n'):
+            marks = b'\n' + data.translate(None, _NO_MARKS)
+            if b'#' in marks or b'\n\n' in marks:
                 rows = [
                     (line, number)
                     for line, number in zip(data.split(b'\n'), numbers)
@@ -260,16 +260,19 @@ def find_form(path: str) -> TableForm:
             count = 0 if _COMMENT.match(line) else _numbers(line, delimiter)
             fields = _fields(line, delimiter)
             # One number with empty cells is a row, one with a text may be a preamble.
-            if count >= _FEWEST_NUMBERS or (count and count == sum(map(bool, fields))):
+            is_single = 0 < count == sum(map(bool, fields))
+            if count >= _FEWEST_NUMBERS or is_single:
                 numbers[len(fields)] += count
                 first.setdefault(len(fields), index)
         size, most = max(numbers.items(), key=lambda item: item[1], default=(0, 0))
         if (most, -size) > best:
             best = (most, -size)
             form = _form(lines, plain, first[size], delimiter)
-    if 'time_s' in _fields(written[0], ',') and not (form and form.header_line):
+    has_header = form is not None and form.header_line > 0
+    names = _fields(written[0], ',')
+    if 'time_s' in names and not has_header:
         number = lines.index(written[0]) + 1  # a recording of the package without good samples
-        return _named(_fields(written[0], ','), number, number + 1, ',', False)
+        return _named(names, number, number + 1, ',', False)
     if form is None:
         raise UserError(
             f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
@@ -342,7 +345,8 @@ def _names(line: str, delimiter: str, count: int) -> list[str] | None:
         # A row of samples may end in a delimiter, and its header not.
         if len(fields) == count - 1 > 1:
             fields.append('')
-        if len(fields) == count and any(fields) and not _numbers(text, mark):
+        are_names = any(fields) and not _numbers(text, mark)
+        if are_names and len(fields) == count:
             return fields
     return None
 
@@ -400,6 +404,7 @@ def csv_writer(path: AnyPath) -> Iterator[Append]:
     with atomic_path(path) as fresh, open(fresh, 'wb') as file:
 
         def append(columns: Columns, info: Mapping[str, str] | None = None) -> None:
+            """Append rows, the first ones below the header."""
             if not file.tell():
                 file.writelines(
                     f'# {key}: {" ".join(value.split())}\n'.encode()

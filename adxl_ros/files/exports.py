@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from functools import partial
+from functools import cache, partial
 import json
 from pathlib import Path
 import re
@@ -39,6 +39,7 @@ FILTER = 'RC filter'  # Name of a part: low-pass of the output
 STEPS = 'ADC steps'  # Name of a part: rounding
 _TEMPLATES = Path(__file__).with_name('export_templates')  # What the files are made of
 _NOT_HELD = 'not held'  # In place of the place of a part that a file lacks
+_HIDDEN_S = 3600.0  # Rest that does not show an unstated walk, s. Chosen: an hour
 _SMALLEST_MG = 5e-4  # Size below which a part counts as 0, mg; chosen: half of the last digit
 
 
@@ -92,9 +93,17 @@ def axes(sensor: Sensor) -> list[Axis]:
     count = len(sensor.axes)
     walk = np.broadcast_to(of_walk.get('density_g_per_rts', 0.0), count) * G0_MPS2
     returns = np.broadcast_to(of_walk.get('return_per_s', 0.0), count)
-    # The columns are the fields of `Axis` behind its name.
-    fields = np.column_stack([zero_g, std, std**2 + step**2 / 12, density, walk, returns, step])
-    return [Axis(name, *values) for name, values in zip(sensor.axes, fields.tolist())]
+    by_field = {
+        'zero_g_mps2': zero_g,
+        'noise_std_mps2': std,
+        'sample_variance': std**2 + step**2 / 12,
+        'noise_density': density,
+        'walk_density': walk,
+        'walk_return_per_s': returns,
+        'step_mps2': step,
+    }
+    rows = np.column_stack(list(by_field.values())).tolist()
+    return [Axis(name, **dict(zip(by_field, row))) for name, row in zip(sensor.axes, rows)]
 
 
 def by_axis(sensor: Sensor, field: str) -> tuple[float, ...]:
@@ -129,26 +138,25 @@ def places(form: Format, sensor: Sensor) -> dict[str, str]:
     }
 
 
-def _head(formats: Environment, export: Export, software: str, prefix: str = '# ') -> str:
+def _head(layouts: Environment, export: Export, software: str, prefix: str = '# ') -> str:
     """Return the head of a file as a comment whose lines begin with a prefix."""
     sensor = export.sensor
     width = max(map(len, export.sizes_mg)) + 2
-    formats.filters |= {'size': size_text, 'column': lambda part: part.ljust(width)}
-    text = formats.get_template('head.jinja').render(
+    layouts.filters |= {'size': size_text, 'column': lambda part: part.ljust(width)}
+    head = layouts.get_template('head.jinja').render(
         export=export,
         software=software,
         version=package_version(),
         missing=[axis for axis in AXES if axis not in sensor.axes],
         of_stage=stage_effects(sensor),
     )
-    lines = [f'{prefix}{line}'.rstrip() for line in text.splitlines()]
-    text = '\n'.join(lines)
-    return text if prefix.startswith('#') else _without_double_dashes(text)
+    comment = '\n'.join(f'{prefix}{line}'.rstrip() for line in head.splitlines())
+    return comment if prefix.startswith('#') else _without_double_dashes(comment)
 
 
-def _without_double_dashes(text: str) -> str:
-    """Return a text with single dashes: a comment of XML may not hold two."""
-    return re.sub('--+', '-', text)
+def _without_double_dashes(comment: str) -> str:
+    """Return a comment with single dashes: one of XML may not hold two."""
+    return re.sub('--+', '-', comment)
 
 
 def stage_effects(sensor: Sensor) -> list[str]:
@@ -206,9 +214,6 @@ def _json(export: Export) -> str:
     )
 
 
-_HIDDEN_S = 3600.0  # Rest that does not show an unstated walk, s. Chosen: an hour
-
-
 class GyroFigures(NamedTuple):
     """The noise of a gyroscope for software that has one value for all axes."""
 
@@ -231,9 +236,12 @@ def gyro_figures(sensor: Sensor) -> GyroFigures | None:
         # Its Allan deviation K·√(τ/3) is that of white noise, N/√τ, after this time.
         walk = float(np.sqrt(3) * white.max() / _HIDDEN_S)
         remark = 'Gyroscope: its random walk is one that an hour at rest does not show.'
-    variances = white**2 * sensor.rate_hz
     return GyroFigures(
-        float(white.max()), walk, variances.tolist(), gyro.bias_at().tolist(), f'# {remark}'
+        white=float(white.max()),
+        walk=walk,
+        variances=(white**2 * sensor.rate_hz).tolist(),
+        bias=gyro.bias_at().tolist(),
+        remark=remark,
     )
 
 
@@ -270,27 +278,27 @@ def text(name: str, export: Export) -> str:
         return _json(export)
     sensor = export.sensor
     values = {field.name: by_axis(sensor, field.name) for field in fields(Axis)[1:]}
-    variance = [
-        v if axis in sensor.axes else UNMEASURED_VARIANCE
-        for axis, v in zip(AXES, values['sample_variance'])
+    variances = [
+        variance if axis in sensor.axes else UNMEASURED_VARIANCE
+        for axis, variance in zip(AXES, values['sample_variance'])
     ]
     coupling = np.eye(3)
     coupling[sensor.axis_indices] = gain(sensor)
     walk = max(values['walk_density'])
-    remark = 'Values are those of the noisiest axis.'
+    remarks = ['Values are those of the noisiest axis.']
     if not walk:
         walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
-        remark += '\n# The random walk is that of a healthy unit: the file states none.'
+        remarks.append('The random walk is that of a healthy unit: the file states none.')
     gyro = gyro_figures(sensor)
-    formats = templates.environment(
+    layouts = templates.environment(
         f'--to {name}', ('adxl_ros', 'files/export_templates'), escapes=False
     )
-    formats.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
-    return formats.get_template(f'{name}.jinja').render(
-        head=partial(_head, formats, export),
+    layouts.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
+    return layouts.get_template(f'{name}.jinja').render(
+        head=partial(_head, layouts, export),
         white=partial(_white_density, export),
         walk=walk,
-        walk_remark=f'# {remark}',
+        walk_remarks=remarks,
         gyro=gyro,
         gyro_covariance=np.diag(gyro.variances).ravel().tolist() if gyro else [],
         sensor=sensor,
@@ -303,21 +311,19 @@ def text(name: str, export: Export) -> str:
         absent=NOT_MEASURED.tolist(),
         walk_a_sample=tuple(density / sensor.rate_hz**0.5 for density in values['walk_density']),
         largest_mps2=_largest_mps2(sensor),
-        covariance=np.diag(variance).ravel().tolist(),
+        covariance=np.diag(variances).ravel().tolist(),
     )
 
 
-def _formats() -> dict[str, Format]:
-    """Read the formats by their name."""
+@cache
+def formats() -> dict[str, Format]:
+    """Return the formats by their names, in the order of the alphabet."""
     stated = yaml.safe_load((_TEMPLATES / 'formats.yaml').read_text(encoding='utf-8'))
-    formats = {}
-    for name, about in stated.items():
+    found = {}
+    for name, about in sorted(stated.items()):
         if not name.startswith('.'):
             holds: dict[str, str] = {}
             for place, parts in about['holds'].items():
                 holds |= dict.fromkeys(parts, place)
-            formats[name] = Format(about['meaning'], holds)
-    return formats
-
-
-FORMATS = _formats()  # Formats by name
+            found[name] = Format(about['meaning'], holds)
+    return found

@@ -25,6 +25,7 @@ _ACCELERATION = 25 * 8  # The same of the linear acceleration
 _END = 37 * 8  # The same of the end
 _QUATERNION = 4  # Numbers of a quaternion, which stand before the orientation's covariance
 _VECTOR = 3  # Numbers of a vector, which stand before its covariance
+_WITH_COVARIANCE = 12  # Numbers of a vector and its covariance
 _DIAGONAL = 4  # Distance of the variances of two axes in a covariance of three
 _UNSET = (0.0, 0.0, 0.0, 1.0, *[0.0] * 9)
 """Quaternion and covariance of an orientation that nobody has set."""
@@ -43,22 +44,32 @@ def _numbers_begin(raw: bytes) -> tuple[str, int]:
     return order, begin
 
 
+def _numbers(raw: bytes, offset: int, count: int) -> tuple[float, ...]:
+    """Return numbers of an Imu at an offset behind its header."""
+    order, begin = _numbers_begin(raw)
+    return struct.unpack_from(f'{order}{count}d', raw, begin + offset)
+
+
+def _with_numbers(raw: bytes, offset: int, numbers: Sequence[float]) -> bytes:
+    """Return an Imu with other numbers at an offset behind its header."""
+    order, begin = _numbers_begin(raw)
+    message = bytearray(raw)
+    struct.pack_into(f'{order}{len(numbers)}d', message, begin + offset, *numbers)
+    return bytes(message)
+
+
 def read(raw: bytes) -> tuple[float, Sequence[float]]:
     """Return the stamp, s, and the linear acceleration, m/s², of a sensor_msgs/Imu."""
-    order, begin = _numbers_begin(raw)
+    order, _ = _numbers_begin(raw)
     sec, nanosec = struct.unpack_from(order + 'iI', raw, _STAMP_OFFSET)
-    return sec + nanosec * 1e-9, struct.unpack_from(order + '3d', raw, begin + _ACCELERATION)
+    return sec + nanosec * 1e-9, _numbers(raw, _ACCELERATION, _VECTOR)
 
 
 def in_mps2(raw: bytes, unit: str) -> bytes:
     """Return an Imu with the acceleration in m/s² that has it in a unit, a key of `GRAVITY`."""
-    order, begin = _numbers_begin(raw)
-    message = bytearray(raw)
-    place = begin + _ACCELERATION
-    values = struct.unpack_from(order + '3d', message, place)
     factor = G0_MPS2 / GRAVITY[unit]
-    struct.pack_into(order + '3d', message, place, *(factor * value for value in values))
-    return bytes(message)
+    values = [factor * value for value in _numbers(raw, _ACCELERATION, _VECTOR)]
+    return _with_numbers(raw, _ACCELERATION, values)
 
 
 def has_orientation(raw: bytes) -> bool:
@@ -67,43 +78,30 @@ def has_orientation(raw: bytes) -> bool:
 
     It states none where the first covariance is -1 (REP-145), nor by the default of the message.
     """
-    order, begin = _numbers_begin(raw)
-    values = struct.unpack_from(order + '13d', raw, begin)
-    return values[_QUATERNION] != -1.0 and any(values[:_QUATERNION]) and values != _UNSET
+    values = _numbers(raw, 0, len(_UNSET))
+    is_stated = values[_QUATERNION] != -1.0 and values != _UNSET
+    return is_stated and any(values[:_QUATERNION])
 
 
 def with_frame(raw: bytes, frame_id: str) -> bytes:
     """Return an Imu with another frame in its header."""
     order, begin = _numbers_begin(raw)
     name = frame_id.encode() + b'\0'
-    padding = (_STAMP_OFFSET - _FRAME_LENGTH.stop - len(name)) % 8
-    return (
-        raw[: _FRAME_LENGTH.start]
-        + struct.pack(order + 'I', len(name))
-        + name
-        + bytes(padding)
-        + raw[begin:]
-    )
+    padding = bytes((_STAMP_OFFSET - _FRAME_LENGTH.stop - len(name)) % 8)
+    length = struct.pack(order + 'I', len(name))
+    return raw[: _FRAME_LENGTH.start] + length + name + padding + raw[begin:]
 
 
 def turned(raw: bytes, mounting: Mounting) -> bytes:
     """Return an Imu with angular velocity and orientation, if any, in the frame of the robot."""
-    order, begin = _numbers_begin(raw)
-    message = bytearray(raw)
+    message = raw
     if has_orientation(raw):
-        struct.pack_into(
-            order + '4d', message, begin, *mounting.rotate_orientation(orientation(raw))
-        )
-    rate = struct.unpack_from(order + '12d', raw, begin + _ANGULAR_VELOCITY)
-    if rate[_VECTOR] != -1.0:
-        struct.pack_into(
-            order + '12d',
-            message,
-            begin + _ANGULAR_VELOCITY,
-            *mounting.rotate(rate[:_VECTOR]),
-            *mounting.rotate_matrix(rate[_VECTOR:]),
-        )
-    return bytes(message)
+        message = _with_numbers(message, 0, mounting.rotate_orientation(orientation(raw)))
+    rate = _numbers(raw, _ANGULAR_VELOCITY, _WITH_COVARIANCE)
+    if rate[_VECTOR] == -1.0:
+        return message
+    turned_rate = (*mounting.rotate(rate[:_VECTOR]), *mounting.rotate_matrix(rate[_VECTOR:]))
+    return _with_numbers(message, _ANGULAR_VELOCITY, turned_rate)
 
 
 def less_bias(raw: bytes, bias_radps: Sequence[float], variances: Sequence[float]) -> bytes:
@@ -112,9 +110,7 @@ def less_bias(raw: bytes, bias_radps: Sequence[float], variances: Sequence[float
 
     variances: those of the bias, (rad/s)², which a covariance that is stated grows by.
     """
-    order, begin = _numbers_begin(raw)
-    place = begin + _ANGULAR_VELOCITY
-    rate = list(struct.unpack_from(order + '12d', raw, place))
+    rate = list(_numbers(raw, _ANGULAR_VELOCITY, _WITH_COVARIANCE))
     if rate[_VECTOR] == -1.0:
         return raw
     is_stated = any(rate[_VECTOR:])
@@ -122,15 +118,12 @@ def less_bias(raw: bytes, bias_radps: Sequence[float], variances: Sequence[float
         rate[axis] -= bias
         if is_stated:
             rate[_VECTOR + _DIAGONAL * axis] += variance
-    message = bytearray(raw)
-    struct.pack_into(order + '12d', message, place, *rate)
-    return bytes(message)
+    return _with_numbers(raw, _ANGULAR_VELOCITY, rate)
 
 
 def orientation(raw: bytes) -> tuple[float, ...]:
     """Return the quaternion x, y, z, w of an Imu that `read` accepted."""
-    order, begin = _numbers_begin(raw)
-    return struct.unpack_from(order + '4d', raw, begin)
+    return _numbers(raw, 0, _QUATERNION)
 
 
 def corrected(
@@ -141,12 +134,9 @@ def corrected(
 
     Each is followed by its covariance by rows, rad² and (m/s²)²: (13,) and (12,).
     """
-    order, begin = _numbers_begin(raw)
-    message = bytearray(raw)
     if orientation is not None:
-        struct.pack_into(order + '13d', message, begin, *orientation)
-    struct.pack_into(order + '12d', message, begin + _ACCELERATION, *acceleration)
-    return bytes(message)
+        raw = _with_numbers(raw, 0, orientation)
+    return _with_numbers(raw, _ACCELERATION, acceleration)
 
 
 def vector3_stamped(raw: bytes, vector: Sequence[float]) -> bytes:

@@ -9,7 +9,6 @@ Where a table is not understood, `mapping_proposal` finds the mapping that it mo
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-import re
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
@@ -17,14 +16,12 @@ from adxl_ros.files.column_mapping import (
     drop_samples,
     first_names,
     GYRO_ROLES,
-    is_sensor_step,
     Quantity,
     ReadingOptions,
     ROLES,
     Source,
     Table,
     TableBlock,
-    time_unit_of_step,
     Unit,
     unit_in_name,
     unit_name,
@@ -38,23 +35,17 @@ from adxl_ros.files.recording_columns import (
     limits,
     Recording,
     sensor_columns,
-    StampCheck,
     TIME,
     VOLTS,
 )
-from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
+from adxl_ros.files.stamp_check import StampCheck
+from adxl_ros.files.table_stamps import CountedStamps, StampColumn
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.kinematics import stage_angles
-from adxl_ros.process import option, pasted
+from adxl_ros.process import option
 import numpy as np
 
-_TIME_LIMIT_S = 9e9  # Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)
-_EPOCH_S = 1e8
-"""First time from which times count from 1970, s: three years (chosen: no sensor runs so long)."""
 _TURN_RAD = 2 * np.pi  # Largest roll and pitch, rad
-_FEWEST_STAMPS = 8  # Stamps whose steps show their unit. Chosen: a lost sample hides no median
-_WHOLE = 1e-3  # Largest distance of a stamp from a whole number by rounding, in its unit
-
 _NATIVE = {
     TIME: 'time',
     **{column: joint for joint, column in JOINTS.items()},
@@ -80,36 +71,40 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
     names = table.names
     if table.repeated:
         raise NotNativeError(f'{table.header}: column {table.repeated} stands twice; keep one')
-    # Where one form of output is there, the other may stand there in any unit.
-    outputs = next(
-        (kind for kind in (output, VOLTS, ACCEL) if set(kind) & set(names)), (*VOLTS, *ACCEL)
-    )
-    roles = {**_NATIVE, **dict(zip(outputs, 2 * AXES))}
-    stems = {column.rpartition('_')[0]: column for column in roles}
-    for number, name in enumerate(names, 1):
-        stem, _, unit = name.lower().rpartition('_')
-        column = stems.get(stem, name)
-        is_wrong = column not in names and roles[column] not in GYRO_ROLES
-        if is_wrong and unit_name(unit, ROLES[roles[column]]):
-            # Arrays in memory and the columns of binary files stand in no line.
-            place = f'{table.header}:{number}' if table.header_line else table.path
-            raise NotNativeError(
-                f'{place}: column {name} is in another unit; expected the column {column}'
-            )
+    _refuse_other_units(table, output)
     missing = [column for column in (TIME, *output) if column not in names]
     if missing:
         present = f'; the columns are {first_names(names)}' if output else ''
         raise NotNativeError(f'{table.header}: no column {missing[0]}{present}')
     try:
-        outputs = output or sensor_columns(names, table.header)
+        axes = output or sensor_columns(names, table.header)
     except UserError as error:
         raise NotNativeError(str(error)) from None
     sources = {
         role: Source(name, name.rpartition('_')[2])
-        for name, role in {**_NATIVE, **dict(zip(outputs, AXES))}.items()
+        for name, role in {**_NATIVE, **dict(zip(axes, AXES))}.items()
         if name in names
     }
     return ColumnMapping({**_gyro_sources(names), **sources}, table.path)
+
+
+def _refuse_other_units(table: Table, output: tuple[str, ...]) -> None:
+    """Refuse a column that is one of the package but for its unit; a gyroscope may have any."""
+    names = table.names
+    quantities = {column: ROLES[role] for column, role in _NATIVE.items() if column not in GYRO}
+    # Where one form of output is there, the other may stand there in any unit.
+    forms = [form for form in (output, VOLTS, ACCEL) if not set(form).isdisjoint(names)]
+    quantities |= dict.fromkeys(forms[0] if forms else (*VOLTS, *ACCEL), Quantity.OUTPUT)
+    columns = {column.rpartition('_')[0]: column for column in quantities}
+    for number, name in enumerate(names, 1):
+        stem, _, unit = name.lower().rpartition('_')
+        column = columns.get(stem, name)
+        if column not in names and unit_name(unit, quantities[column]):
+            # Arrays in memory and the columns of binary files stand in no line.
+            place = f'{table.header}:{number}' if table.header_line else table.path
+            raise NotNativeError(
+                f'{place}: column {name} is in another unit; expected the column {column}'
+            )
 
 
 def _gyro_sources(names: Sequence[str]) -> dict[str, Source]:
@@ -169,13 +164,14 @@ class _Converter:
         self._axes = [self.sources[axis] for axis in AXES if axis in self.sources]
         self._is_volts = self._unit(AXES[0]).is_volts
         self._check_axes()
-        self._stamps = StampCheck(table.path, reading.drop_bad_stamps)
+        self._check = StampCheck(table.path, reading.drop_bad_stamps)
+        self._stamps: CountedStamps | StampColumn
+        if reading.rate_hz is not None:
+            self._stamps = CountedStamps(reading.rate_hz, table.is_every_row_a_step)
+        else:
+            self._stamps = StampColumn(table.path, self.sources, self._check, not is_native)
         self._remarks: list[str] = []
-        self._epoch_ns: int | None = None
-        self._begin = 0.0  # Origin of the times in the unit of the stamps
         self._empty = self._incomplete = 0  # Rows without a reading, and with a part of one
-        self._is_every_row_a_step = table.is_every_row_a_step
-        self._rows = 0  # Steps of the sample rate so far
         self._last_beta_rad = 0.0
 
     def _source(self, table: Table, role: str, source: Source) -> Source:
@@ -208,8 +204,9 @@ class _Converter:
             raise UserError(
                 f'{self._where}: some axes are in volts and others are not; state one kind'
             )
-        is_named_volts = self._axes[0].column in VOLTS
-        if self._is_native and self._reading.unit and self._is_volts != is_named_volts:
+        is_contradicted = self._is_volts != (self._axes[0].column in VOLTS)
+        has_both = self._is_native and bool(self._reading.unit)
+        if has_both and is_contradicted:
             raise UserError(
                 f'{option(unit=self._reading.unit)}: {self._axes[0].column} of '
                 f'{self._path} says another quantity; name the columns by {option("columns")}'
@@ -226,14 +223,13 @@ class _Converter:
             is_sample = is_row & self._is_complete(block, outputs)
         self._incomplete += int((is_row & ~is_sample).sum())
         for source, values in zip(self._axes, outputs.T):
-            _refuse(
-                block,
-                source,
+            block.refuse(
+                source.column,
                 is_sample & ~(np.abs(values) <= LIMIT),
                 f'no reading of a sensor in {source.unit}',
                 f'every sample needs it; {drop_samples()}',
             )
-        time_s, is_kept = self._times(block, is_row, is_sample)
+        time_s, is_kept = self._stamps(block, is_row, is_sample)
         columns = dict(zip(VOLTS if self._is_volts else ACCEL, outputs.T))
         columns |= self._references(block)
         if self._is_native:
@@ -241,7 +237,7 @@ class _Converter:
             del columns[TIME]
         columns = {name: np.ascontiguousarray(values[is_kept]) for name, values in columns.items()}
         if not self.count and is_kept.any():
-            self._look_at_first(time_s[is_kept])
+            self._remarks += self._stamps.look_at_first(time_s[is_kept])
         self.count += int(is_kept.sum())
         return Recording(
             self._path,
@@ -249,10 +245,10 @@ class _Converter:
             columns,
             {key: text for key, text in block.info.items() if key != 'epoch_ns'},
             cut=block.cut,
-            epoch_ns=self._epoch_ns or 0,
+            epoch_ns=self._stamps.epoch_ns or 0,
             done=block.done,
-            remarks=(*self._remarks, *self._left_out(), *self._stamps.remarks),
-            bad_stamps=self._stamps.bad,
+            remarks=(*self._remarks, *self._left_out(), *self._check.remarks),
+            bad_stamps=self._check.bad,
         )
 
     def _left_out(self) -> list[str]:
@@ -270,7 +266,7 @@ class _Converter:
         is_complete = np.isfinite(outputs).all(axis=1)
         if self._reading.rate_hz is None:
             is_complete &= np.isfinite(block.columns[self.sources['time'].column])
-        return np.asarray(is_complete)
+        return is_complete
 
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""
@@ -290,7 +286,7 @@ class _Converter:
                 (-_TURN_RAD, _TURN_RAD) if is_tilt else limits(_COLUMNS.get(role, role))
             )
             is_wrong = (converted < lowest) | (converted > highest)
-            _refuse(block, source, is_wrong, f'no {role} in {source.unit}')
+            block.refuse(source.column, is_wrong, f'no {role} in {source.unit}')
             values[role] = converted
         if 'roll' in values:
             values['alpha'], beta_rad = stage_angles(values['roll'], values['pitch'])
@@ -301,88 +297,3 @@ class _Converter:
             self._last_beta_rad = float(turned[-1])
             values['beta'] = beta_rad
         return {name: values[role] for name, role in _NATIVE.items() if role in values}
-
-    def _times(
-        self, block: TableBlock, is_row: np.ndarray, is_sample: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return stamps, s, (n,), and which rows are kept, (n,); a part of a reading has one."""
-        if self._reading.rate_hz is not None:
-            is_step = is_row | self._is_every_row_a_step
-            number = self._rows + np.cumsum(is_step) - 1
-            self._rows += int(is_step.sum())
-            return number / self._reading.rate_hz, is_sample
-        source = self.sources['time']
-        unit = self._unit('time')
-        stamps = block.columns[source.column]
-        _refuse(
-            block,
-            source,
-            is_sample & ~(np.abs(unit.convert(stamps)) < _TIME_LIMIT_S),
-            f'no time in {source.unit} (200 years at most)',
-            f'every sample needs a time: give {option(rate="HZ")} to stamp by index, or delete '
-            f'the line; {drop_samples()}',
-        )
-        if self._epoch_ns is None and is_sample.any():
-            first_s = float(unit.convert(stamps[is_sample][:1])[0])
-            self._set_epoch(block.info.get('epoch_ns', '0'), first_s)
-        time_s = unit.convert(stamps - self._begin)
-        return time_s, self._stamps.increasing(
-            time_s, is_sample, lambda row: block.where(row, source.column)
-        )
-
-    def _set_epoch(self, stated: str, first_s: float) -> None:
-        """Take the epoch that a file states, or the first time where it counts from 1970."""
-        if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', stated):
-            raise UserError(f'{self._path}: epoch_ns is {stated!r}, expected whole nanoseconds')
-        self._epoch_ns = int(stated)
-        if first_s > _EPOCH_S and not self._is_native and not self._epoch_ns:
-            self._epoch_ns = int(first_s) * 1_000_000_000
-            self._begin = int(first_s) * self._unit('time').divisor
-
-    def _look_at_first(self, time_s: np.ndarray) -> None:
-        """Refuse stamps that are in another unit, and note those in bursts."""
-        if len(time_s) <= _FEWEST_STAMPS or self._reading.rate_hz is not None:
-            return
-        self._check_step(time_s)
-        if bursts := describe_bursts(time_s):
-            self._remarks.append(
-                f'{self._path}: {bursts}; this rate is '
-                f'used, and {option(rate="HZ")} stamps by index'
-            )
-
-    def _check_step(self, time_s: np.ndarray) -> None:
-        """Refuse stamps whose steps no sensor has."""
-        source = self.sources['time']
-        divisor = self._unit('time').divisor
-        rate_hz = stamped_rate_hz(time_s)
-        stamps = time_s * divisor
-        step = divisor / rate_hz
-        is_whole = bool((np.abs(stamps - np.rint(stamps)) < _WHOLE).all())
-        if not is_sensor_step(1 / rate_hz, is_whole):
-            unit = time_unit_of_step(step, is_whole)
-            fitting = ColumnMapping({**self.sources, 'time': Source(source.column, unit)})
-            right = f'if that is right, give {option(rate=f"{rate_hz:.6g}")}'
-            if is_whole and step == 1:
-                right = f'if it counts samples, give {option(rate="HZ")}'
-            paste = ''
-            if unit != source.unit:
-                right += f', and if they are {unit}:'
-                paste = pasted(columns=str(fitting))
-            raise UserError(
-                f'{self._path}: {source.column} has steps of {step:.4g}, which as {source.unit} '
-                f'are {rate_hz:.6g} Hz; {right}',
-                paste,
-            )
-
-
-def _refuse(
-    block: TableBlock, source: Source, wrong: np.ndarray, reason: str, reason_of_none: str = ''
-) -> None:
-    """Refuse cells of a column, (n,): for a reason, or for another one where they are empty."""
-    if wrong.any():
-        row = int(wrong.argmax())
-        value = block.columns[source.column][row]
-        text = f'{value:g}, {reason}; delete the line, or correct the unit'
-        if np.isnan(value):
-            text = f'empty or NaN; {reason_of_none}'
-        raise UserError(f'{block.where(row, source.column)} is {text}')

@@ -113,6 +113,8 @@ it, and 1 g of an analog sensor that is read about the middle of its supply abov
 _TURNED = 0.3
 """Smallest spread of an axis in that of another one of a sensor that is turned about all axes."""
 
+_NEVER_BACK = 0.99  # Smallest share of steps of a time that are not back. Chosen: a few are wrong
+_FORWARD = 0.05  # Smallest share of steps forward. Chosen: stamps of a host come in bursts
 _LARGEST_VOLTS = 9.0  # Readings of an analog sensor are below this, V: supplies have 5 V
 _SMALLEST_COUNTS = 40.0  # Readings in counts are larger: the coarsest sensors have 64 a g
 
@@ -179,7 +181,8 @@ def _guess_output(table: Table, outputs: Sequence[str], readings: np.ndarray) ->
     """Guess what readings, (n, m), mean; None where they are not those of an accelerometer."""
     unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
     is_whole = bool((readings == np.rint(readings)).all())
-    if unit in (None, LSB) and is_whole and _have_lost_sign(readings):
+    may_be_counts = is_whole and unit in (None, LSB)
+    if may_be_counts and _have_lost_sign(readings):
         unit = UNSIGNED
         readings = signed(readings)
     # A sensor that was turned and never reads below 0 has its 0 g in the middle.
@@ -244,12 +247,17 @@ def _time_column(table: Table, values: Columns) -> str | None:
     rising = []
     for name, column in values.items():
         steps = np.diff(column[np.isfinite(column)])
-        if len(steps) > 2 and np.mean(steps >= 0) > 0.99 and np.mean(steps > 0) > 0.05:
+        if len(steps) > 2 and _rises(steps):
             rising.append(name)
     likely = [name for name in rising if not _is_counter(name, values[name])]
     if table.has_names:
         likely = [name for name in rising if _TIME_NAMES.fullmatch(name)] + likely
     return likely[0] if likely else None
+
+
+def _rises(steps: np.ndarray) -> bool:
+    """Return whether steps, (n,), are those of a time: hardly any steps back, and some forward."""
+    return bool(np.mean(steps >= 0) > _NEVER_BACK and np.mean(steps > 0) > _FORWARD)
 
 
 def _is_counter(name: str, column: np.ndarray) -> bool:
@@ -288,6 +296,7 @@ def _outputs(table: Table, names: list[str], values: Columns) -> list[str]:
         return next(filter(None, map(_by_axis, groups)), [])
 
     def scatter(triple: list[str]) -> float:
+        """Return the relative scatter of the length of three columns."""
         length = np.linalg.norm([values[name] for name in triple], axis=0)
         median = np.nanmedian(length)
         return float(np.nanmedian(np.abs(length - median)) / max(median, 1e-12))
@@ -300,9 +309,9 @@ def _by_axis(names: Sequence[str]) -> list[str]:
     by_letter: dict[str, str] = {}
     for name in names:
         bare = re.sub(r'[(\[{].*?[)\]}]', '', name).strip()
-        matches = list(filter(None, map(_AXIS_WORD.fullmatch, _words(bare))))
-        if matches:
-            by_letter.setdefault((matches[-1][1] or matches[-1][2]).lower(), name)
+        *_, last = (None, *filter(None, map(_AXIS_WORD.fullmatch, _words(bare))))
+        if last:
+            by_letter.setdefault((last[1] or last[2]).lower(), name)
     if by_letter:
         axes = AXES[: len(by_letter)]
         return [by_letter[axis] for axis in axes] if set(axes) == set(by_letter) else []
@@ -322,6 +331,8 @@ def _references(values: Columns, used: set[str | None]) -> dict[str, Source]:
             sources[role] = Source(name, unit_in_name(name, ROLES[role]) or usual)
     # An estimate of attitude, which has a yaw, is made of the readings and is no reference.
     is_estimate = any(re.search('(?i)yaw|heading|quat', name) for name in values)
-    if not {'roll', 'pitch'} <= set(sources) or 'alpha' in sources or is_estimate:
-        sources.pop('roll', None), sources.pop('pitch', None)
+    is_attitude = {'roll', 'pitch'} <= set(sources) and not is_estimate
+    if 'alpha' in sources or not is_attitude:
+        sources.pop('roll', None)
+        sources.pop('pitch', None)
     return sources

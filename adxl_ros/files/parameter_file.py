@@ -85,11 +85,6 @@ def nominal_path() -> Path:
     return _params_folder() / 'adxl203.yaml'
 
 
-def any_imu_path() -> Path:
-    """Return the installed file of a stream in m/s² that states nothing of itself."""
-    return _params_folder() / 'any_imu.yaml'
-
-
 def _params_folder() -> Path:
     """Return the folder of the installed parameter files: as ROS has it, else the package's."""
     with suppress(ImportError, LookupError, OSError):
@@ -106,7 +101,8 @@ def _params_folder() -> Path:
 def installed_path(name: AnyPath) -> Path:
     """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
     path = Path(name)
-    if path.exists() or path.suffix or path.name != str(name):
+    may_be_name = path.name == str(name) and not path.suffix
+    if path.exists() or not may_be_name:
         return path
     folder = _params_folder()
     file = folder / f'{path.name.lower().replace("-", "")}.yaml'
@@ -136,8 +132,8 @@ def load(path: AnyPath, may_measure: bool = False) -> Sensor:
 
 
 def usual_path(is_nominal: bool) -> Path:
-    """Return the path of the nominal sensor, or of any IMU."""
-    return nominal_path() if is_nominal else any_imu_path()
+    """Return the path of the nominal sensor, or that of a stream that states nothing of itself."""
+    return nominal_path() if is_nominal else _params_folder() / 'any_imu.yaml'
 
 
 def usual(is_nominal: bool) -> Sensor:
@@ -313,7 +309,8 @@ class _FlatReader:
         unstated = []
         for key, field in SENSOR_FIELDS.items():
             value = field.metadata['placeholder']
-            if may_measure and key not in self.flat and value is not None:
+            can_measure = may_measure and value is not None
+            if can_measure and key not in self.flat:
                 unstated.append(field.name)
                 is_array = field.type == 'np.ndarray'
                 values[field.name] = np.full(len(axes), value) if is_array else value
@@ -381,6 +378,7 @@ class _FlatReader:
         return value
 
     def _check_bounds(self, key: str, values: Any, lower: float, upper: float, unit: str) -> None:
+        """Refuse values beyond their bounds."""
         for value in np.ravel(values):
             self._require(
                 lower <= value <= upper, key, f'{value:g} {unit} is outside {lower:g} to {upper:g}'

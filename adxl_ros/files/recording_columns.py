@@ -4,101 +4,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 import os
 from pathlib import Path
-import re
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import require_own
-from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
+from adxl_ros.files.stamp_check import BadStamps
+from adxl_ros.files.stamps import stamped_rate_hz
+from adxl_ros.files.stream_info import NOMINAL_KEYS, nominal_of, StreamInfo, uncalibrated
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
-from adxl_ros.process import option
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts
 from adxl_ros.report.quantities import column_unit
 import numpy as np
-
-FORMAT = '1'  # Version of the recording format, the key `format`
-
-NO_SERIAL = 'nominal'  # Serial number that stands for no particular unit
-
-NOMINAL_KEYS = ('nominal_zero_g_v', 'nominal_scale_v_per_g')
-"""Keys of the nominal values, V and V/g; each is a field of `Sensor`, too."""
-
-_HIGHEST_RATE_HZ = 1e6
-"""Sample rates from here on are refused, Hz (chosen: ten times the limit of a parameter file)."""
-
-
-@dataclass(frozen=True)
-class StreamInfo:
-    """What a stream states of its sensor; values are checked when they are asked for."""
-
-    texts: Mapping[str, str]  # Values by key, as text
-    where: str  # The file or topic, for messages
-
-    @property
-    def serial(self) -> str:
-        """Return the serial number of the unit; `NO_SERIAL` where none is stated."""
-        return self.texts.get('serial', NO_SERIAL)
-
-    @property
-    def axes(self) -> str | None:
-        """Measured axes; None where they are not stated."""
-        return self.texts.get('axes')
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Sample rate, Hz; None where it is not stated."""
-        if 'rate_hz' not in self.texts:
-            return None
-        rate_hz = _numbers(self.texts['rate_hz'])
-        if len(rate_hz) != 1 or not 0 < rate_hz[0] < _HIGHEST_RATE_HZ:
-            raise UserError(
-                f'{self.where}: rate_hz is {self.texts["rate_hz"]!r}, expected samples a second'
-            )
-        return float(rate_hz[0])
-
-    def nominal_values(self, axes: str) -> dict[str, np.ndarray]:
-        """Return the stated nominal values, (m,), by the name of the field of `Sensor`."""
-        values = {}
-        for key in NOMINAL_KEYS:
-            if key in self.texts:
-                numbers = _numbers(self.texts[key])
-                if len(numbers) != len(axes) or not np.isfinite(numbers).all():
-                    raise UserError(
-                        f'{self.where}: {key} is {self.texts[key]!r}, expected '
-                        f'{len(axes)} numbers, one for each axis'
-                    )
-                values[key] = numbers
-        return values
-
-
-def _numbers(text: str) -> np.ndarray:
-    """Return the numbers of a list; none if one of them cannot be read."""
-    try:
-        return np.array([float(word) for word in re.split(r'[\s,;\[\]()]+', text) if word])
-    except ValueError:
-        return np.zeros(0)
-
-
-def sensor_info(sensor: Sensor) -> dict[str, str]:
-    """Return the keys and values that a stream of `sensor` states."""
-    return {
-        'serial': sensor.serial,
-        'axes': sensor.axes,
-        **{key: ', '.join(map(repr, getattr(sensor, key).tolist())) for key in NOMINAL_KEYS},
-        'rate_hz': repr(float(sensor.rate_hz)),
-        'format': FORMAT,
-    }
-
-
-def converted_info(texts: Mapping[str, str], sensor: Sensor) -> dict[str, str]:
-    """Return what a recording states after a conversion by the nominal values of `sensor`."""
-    unchanged = {key: texts[key] for key in ('serial', 'rate_hz') if key in texts}
-    return {**texts, **sensor_info(sensor), **unchanged}
-
 
 TIME = 'time_s'
 VOLTS = ('x_v', 'y_v', 'z_v')  # Columns of the ADC volts by axis
@@ -123,13 +43,6 @@ works colder or hotter, and a room in kelvin is above it; millivolts of a supply
 def limits(column: str) -> tuple[float, float]:
     """Return the lowest and highest value of a column, in its unit."""
     return _REFERENCE_LIMITS.get(column, (-LIMIT, LIMIT))
-
-
-class BadStamps(NamedTuple):
-    """Samples whose stamp does not increase."""
-
-    duplicates: int  # Samples with the stamp of the sample before
-    backward: int  # Samples whose stamp is earlier
 
 
 @dataclass(repr=False, eq=False)
@@ -297,6 +210,7 @@ class Recording:
         return to_nominal_mps2(self.volts(sensor), sensor)
 
     def _output(self, sensor: Sensor) -> tuple[tuple[str, ...], np.ndarray]:
+        """Return the columns of the axes of a sensor, and what they hold, (n, m)."""
         names = self.sensor_columns
         if len(names) < len(sensor.axes):
             raise UserError(
@@ -307,6 +221,7 @@ class Recording:
         return names, np.column_stack([self.columns[name] for name in names])
 
     def _nominal(self, sensor: Sensor) -> Sensor:
+        """Return a sensor with the nominal values that the recording states."""
         stated: dict[str, Any] = {
             name: values[: len(sensor.axes)]
             for name, values in self.stream_info.nominal_values(self.axes).items()
@@ -343,207 +258,9 @@ def concatenate(parts: Iterable[Recording]) -> Recording:
     )
 
 
-class StampCheck:
-    """Finds samples whose stamp does not increase: they are refused, or left out and counted."""
-
-    def __init__(self, path: str, may_drop: bool) -> None:
-        self.bad = BadStamps(0, 0)  # What was left out so far
-        self._path = path
-        self._may_drop = may_drop
-        self._last_s = -np.inf
-
-    def increasing(
-        self, time_s: np.ndarray, is_sample: np.ndarray, where: Callable[[int], str]
-    ) -> np.ndarray:
-        """Return which samples among rows, (n,), increase; `where` names the place of a row."""
-        latest = np.maximum.accumulate(
-            np.concatenate([[self._last_s], np.where(is_sample, time_s, -np.inf)])
-        )
-        self._last_s = latest[-1]
-        latest = latest[:-1]
-        wrong = is_sample & ~(time_s > latest)
-        stands = wrong & (time_s == latest)
-        if wrong.any() and not self._may_drop:
-            row = int(wrong.argmax())
-            early_s = latest[row] - time_s[row]
-            fault = f'time runs backwards, {early_s:.3g} s before the newest sample'
-            if stands[row]:
-                fault = 'time stands still'
-            clauses = (
-                fault,
-                describe_bursts(time_s[is_sample]),
-                f'{option(drop_bad_stamps=True)} leaves such samples out, {option(rate="HZ")} '
-                'stamps by index',
-            )
-            raise UserError(f'{where(row)}: {"; ".join(filter(None, clauses))}')
-        duplicates = int(stands.sum())
-        self.bad = BadStamps(
-            self.bad.duplicates + duplicates, self.bad.backward + int(wrong.sum()) - duplicates
-        )
-        return is_sample & ~wrong
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Return what was left out, for people."""
-        kinds = ('samples with the stamp of the one before', 'samples whose stamp steps back')
-        return tuple(
-            f'{self._path}: left out, {kind}: {count}'
-            for kind, count in zip(kinds, self.bad)
-            if count
-        )
-
-
-def check_same_sensor(info: StreamInfo, axes: str, sensor: Sensor) -> None:
-    """Refuse samples of another sensor, or with other axes or nominal values."""
-    version = info.texts.get('format', FORMAT)
-    if version != FORMAT:
-        raise UserError(
-            f'{info.where}: format version {version}, but this package reads version '
-            f'{FORMAT}; update the package'
-        )
-    _check_serial(info, sensor)
-    if axes != sensor.axes:
-        raise UserError(
-            f'{info.where}: samples of the axes {axes}, but the parameters of '
-            f'{sensor.serial} are for {sensor.axes}; name the file of this sensor'
-        )
-    for key, stated in info.nominal_values(axes).items():
-        expected = getattr(sensor, key)
-        if not np.array_equal(stated, expected):
-            raise UserError(
-                f'{info.where}: {key} is {stated.tolist()}, but {expected.tolist()} '
-                f'in the parameters of {sensor.serial}; name the parameter file that '
-                'the samples were made with'
-            )
-
-
-def _check_serial(info: StreamInfo, sensor: Sensor) -> None:
-    if info.serial != sensor.serial and NO_SERIAL not in (info.serial, sensor.serial):
-        raise UserError(
-            f'{info.where}: is of the sensor {info.serial}, but the parameters are of '
-            f'{sensor.serial}; give the parameters of that sensor, or nominal ones'
-        )
-
-
-def uncalibrated(sensor: Sensor, info: StreamInfo, axes: str, rate_hz: float) -> Sensor:
-    """Return the nominal sensor that a stream states, without a fitted coefficient."""
-    measured = {key: text for key, text in sensor.provenance.items() if key == 'noise_from'}
-    bare = with_axes(
-        replace(
-            sensor.without_covariance(),
-            model='nominal',
-            effects=(),
-            values={},
-            provenance=measured,
-        ),
-        axes,
-    )
-    stated: dict[str, Any] = dict(info.nominal_values(axes))
-    return replace(bare, serial=info.texts.get('serial', sensor.serial), rate_hz=rate_hz, **stated)
-
-
-def nominal_of(
-    sensor: Sensor, info: StreamInfo, axes: str | None = None, rate_hz: float | None = None
-) -> Sensor:
-    """Return the nominal sensor of a stream, whose serial number must not contradict `sensor`."""
-    _check_serial(info, sensor)
-    axes = axes or info.axes or sensor.axes
-    nominal = uncalibrated(sensor, info, axes, rate_hz or info.rate_hz or sensor.rate_hz)
-    return replace(nominal, serial=sensor.serial) if info.serial == NO_SERIAL else nominal
-
-
 def recorded_nominal(sensor: Sensor, recording: Recording) -> Sensor:
     """Return the nominal sensor of a recording, with the sample rate of its stamps."""
     nominal = nominal_of(sensor, recording.stream_info, recording.axes, recording.rate_hz)
     return replace(
         nominal, provenance={**nominal.provenance, 'rate_from': Path(recording.path).name}
     )
-
-
-LONGEST_MOVE_NS = 1e8
-"""Longest time between two messages in which a joint moves, ns, that is interpolated. Chosen: an
-acceleration of 1 rad/s² then bends the path by 1 mrad, which is the noise of an ADXL203."""
-USUAL_GAPS = 3.0
-"""Gap between messages, in usual ones, that is bridged, however long. Chosen: a slow reference
-loses single messages."""
-
-
-def seconds(stamp_ns: int) -> str:
-    """Return a stamp, ns, as text in seconds with all nanoseconds."""
-    whole_s, rest_ns = divmod(int(stamp_ns), 1_000_000_000)
-    return f'{whole_s}.{rest_ns:09d} s'
-
-
-class Track:
-    """
-    One reference over time.
-
-    Between two messages the value is on the straight line between theirs; angles are not
-    wrapped. Before the first and after the last message their value is held for one period of the
-    reference; beyond that the reference is NaN. So it is in a long gap over which it has changed:
-    nobody knows how.
-    """
-
-    def __init__(
-        self, where: str, stamp_ns: np.ndarray, value: np.ndarray, longest_ns: float = np.inf
-    ) -> None:
-        """
-        Take the messages.
-
-        stamp_ns: stamps, ns, (k,). Of messages with the same stamp the last one counts; value:
-        values, (k,); NaN where it was not sampled; longest_ns: gap that is bridged, ns.
-        """
-        stamps = stamp_ns[~np.isnan(value)]
-        values = value[~np.isnan(value)]
-        step = np.diff(stamps)
-        if (step < 0).any():
-            i = int((step < 0).argmax())
-            raise UserError(
-                f'{where}: time runs backwards: {seconds(stamps[i + 1])} comes '
-                f'after {seconds(stamps[i])}'
-            )
-        is_last = np.append(step > 0, True)[: len(stamps)]
-        self._stamp_ns = stamps[is_last]
-        self._value = values[is_last]
-        step = step[step > 0]
-        self._usual_ns = float(np.median(step)) if len(step) else 0.0
-        self._longest_ns = max(longest_ns, USUAL_GAPS * self._usual_ns)
-        self._is_exact = True  # Whether each sample so far has a message with its own stamp
-
-    def interpolate(self, stamp_ns: np.ndarray) -> np.ndarray:
-        """Return the reference at ascending stamps, ns, (n,): (n,), NaN where it is unknown."""
-        if not len(self._stamp_ns) or not len(stamp_ns):
-            return np.full(len(stamp_ns), np.nan)
-        first, last = np.searchsorted(self._stamp_ns, stamp_ns[[0, -1]])
-        part = slice(max(first - 1, 0), last + 1)  # The messages around the samples
-        values = self._value[part]
-        begin_ns = self._stamp_ns[part][0]
-        sample_ns = stamp_ns - begin_ns
-        message_ns = self._stamp_ns[part] - begin_ns
-        result = np.interp(sample_ns, message_ns, values)
-        is_known = (sample_ns >= -self._usual_ns) & (sample_ns <= message_ns[-1] + self._usual_ns)
-        after = np.searchsorted(message_ns, sample_ns).clip(max=len(message_ns) - 1)
-        is_long = np.append(
-            False, (np.diff(message_ns) > self._longest_ns) & (np.diff(values) != 0)
-        )
-        is_inside = (sample_ns > message_ns[0]) & (sample_ns < message_ns[after])
-        result[~is_known | (is_inside & is_long[after])] = np.nan
-        self._is_exact &= bool((sample_ns == message_ns[after])[is_known].all())
-        return result
-
-    @property
-    def alignment(self) -> float:
-        """
-        How well the reference was aligned so far: its residual, in its unit.
-
-        It is the rms difference between each message and the straight line between its
-        neighbours. Interpolation over twice the period misses it, so that it bounds the error
-        over one period. It is 0 where every sample has a message with its own stamp.
-        """
-        if self._is_exact or len(self._value) < 3:
-            return 0.0
-        time_ns = self._stamp_ns - self._stamp_ns[0]
-        value = self._value
-        share = (time_ns[1:-1] - time_ns[:-2]) / (time_ns[2:] - time_ns[:-2])
-        residual = value[1:-1] - (value[:-2] + share * (value[2:] - value[:-2]))
-        return float(np.sqrt(np.mean(residual**2)))

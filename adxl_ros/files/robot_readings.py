@@ -93,6 +93,7 @@ def read(
 
 
 def _from_table(path: str) -> RobotReadings:
+    """Read joints and base from the columns of a table."""
     table = open_table(path)
     if 'time_s' not in table.names:
         raise UserError(f'{path}: no column time_s beside the joints of a robot')
@@ -123,16 +124,34 @@ def _track(time_s: np.ndarray, values: np.ndarray) -> JointTrack:
     return JointTrack(read_s, values[known][first])
 
 
-def _poses_in(message: Any, kind: str, root: str) -> list[tuple]:
-    """Return header, moving frame, place and turn of odometry, or of the root in transforms."""
+class _Pose(NamedTuple):
+    """A pose of a frame that moves."""
+
+    frame: str
+    stamp_ns: int
+    values: tuple[float, ...]  # x, y, z, m, and a quaternion x, y, z, w
+
+
+def _pose(message: Any, place: Any, turn: Any) -> _Pose:
+    """Return the pose of a message, by its place and its turn."""
+    stamp = message.header.stamp
+    return _Pose(
+        frame=message.child_frame_id.strip('/'),
+        stamp_ns=stamp.sec * 1_000_000_000 + stamp.nanosec,
+        values=(place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w),
+    )
+
+
+def _poses_in(message: Any, kind: str, root: str) -> list[_Pose]:
+    """Return the pose of odometry, or those of the root in transforms."""
     if kind == _ODOMETRY:
         pose = message.pose.pose
-        return [(message.header, message.child_frame_id, pose.position, pose.orientation)]
-    return [
-        (each.header, each.child_frame_id, each.transform.translation, each.transform.rotation)
+        return [_pose(message, pose.position, pose.orientation)]
+    poses = [
+        _pose(each, each.transform.translation, each.transform.rotation)
         for each in message.transforms
-        if each.child_frame_id.strip('/') == root
     ]
+    return [pose for pose in poses if pose.frame == root]
 
 
 def _base(bag: Bag, root: str, epoch_ns: int) -> JointTrack | None:
@@ -140,27 +159,31 @@ def _base(bag: Bag, root: str, epoch_ns: int) -> JointTrack | None:
     store = typestore()
     kinds = dict(sorted(bag.types))
     odometry = [topic for topic, kind in kinds.items() if kind == _ODOMETRY]
-    topics = odometry or [
-        topic for topic, kind in kinds.items() if kind == _TRANSFORMS and topic.endswith('tf')
-    ]
-    # Stamps and poses by topic and the frame that moves
-    moving: dict[tuple[str, str], tuple[list[int], list[list[float]]]] = {}
+    transforms = [topic for topic, kind in kinds.items() if kind == _TRANSFORMS]
+    topics = odometry or [topic for topic in transforms if topic.endswith('tf')]
+    found: dict[tuple[str, str], list[_Pose]] = {}  # By topic and the frame that moves
     for topic in topics:
         for raw in bag.messages(topic):
             message = store.deserialize_cdr(raw, kinds[topic])
-            for header, child, place, turn in _poses_in(message, kinds[topic], root):
-                stamps, poses = moving.setdefault((topic, child.strip('/') or root), ([], []))
-                stamps.append(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)
-                poses.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
-    moving = {key: track for key, track in moving.items() if np.ptp(track[1], axis=0).any()}
+            for pose in _poses_in(message, kinds[topic], root):
+                found.setdefault((topic, pose.frame or root), []).append(pose)
+    tracks = {
+        key: _track(
+            (np.array([pose.stamp_ns for pose in poses]) - epoch_ns) / 1e9,
+            np.array([pose.values for pose in poses]),
+        )
+        for key, poses in found.items()
+    }
+    moving = {
+        key: track for key, track in tracks.items() if (track.values != track.values[:1]).any()
+    }
     if not moving:
         return None
-    of_root = [key for key in moving if key[1] == root]
+    of_root = [track for (_, frame), track in moving.items() if frame == root]
     if len(of_root) != 1:
         raise UserError(
             f'{bag.path}: {len(of_root) or "no"} topics have the pose of {root}, the root of the '
             f'URDF; there are {", ".join(f"{t} of {child}" for t, child in moving)}; record one '
             'for the root, or give a URDF whose root that frame is'
         )
-    stamps, poses = moving[of_root[0]]
-    return _track((np.array(stamps) - epoch_ns) / 1e9, np.array(poses))
+    return of_root[0]

@@ -16,6 +16,7 @@ from typing import NamedTuple
 from adxl_ros.model.constants import TINY
 import numpy as np
 
+_FEWEST_STEPS = 8  # Steps in which bursts are looked for. Chosen: fewer hold no two bursts
 _BETWEEN_BURSTS_QUANTILE = 0.985
 """Quantile of the steps that is one between bursts (chosen: a burst has at most 64 samples)."""
 _WITHIN_BURST = 0.1
@@ -47,7 +48,7 @@ _ROUNDS = 8  # Most rounds of period and missing samples (chosen: two or three s
 def burst_ends(time_s: np.ndarray) -> np.ndarray:
     """Return the samples, (k,), that end a burst of stamps, s, (n,): all where none is seen."""
     steps_s = np.diff(time_s)
-    if len(steps_s) >= 8 and np.median(steps_s) < _MEDIAN_OF_BURSTS * steps_s.mean():
+    if len(steps_s) >= _FEWEST_STEPS and np.median(steps_s) < _MEDIAN_OF_BURSTS * steps_s.mean():
         is_short = steps_s < _WITHIN_BURST * np.quantile(steps_s, _BETWEEN_BURSTS_QUANTILE)
         if is_short.mean() >= _LEAST_WITHIN_BURSTS:
             return np.flatnonzero(~is_short)
@@ -59,78 +60,78 @@ def burst_samples(time_s: np.ndarray) -> int:
     return round((len(time_s) - 1) / max(len(burst_ends(time_s)), 1))
 
 
-def lacks_samples(time_s: np.ndarray, period: float) -> np.ndarray:
+def lacks_samples(time_s: np.ndarray, period_s: float) -> np.ndarray:
     """
     Return in which steps of stamps, s, (n,), samples are missing, (n − 1,) bool.
 
     They are longer than a period, s, and the stamps nearby do not make up for it. A host that
     stalls takes the samples that have waited at once, so that nothing is missing.
     """
-    lacks = np.diff(time_s) > _LACKING_STEP * period
+    lacks = np.diff(time_s) > _LACKING_STEP * period_s
     long = np.flatnonzero(lacks)
-    excess_s = time_s[long + 1] - time_s[long] - period
-    lacking = np.maximum(np.rint(excess_s / period), 1)
+    excess_s = time_s[long + 1] - time_s[long] - period_s
+    lacking = np.maximum(np.rint(excess_s / period_s), 1)
     for factor in _NEARBY:
         reach = np.rint(factor * lacking).astype(np.intp)
         first = np.maximum(long - reach, 0)
         last = np.minimum(long + 1 + reach, len(time_s) - 1)
-        late_s = time_s[last] - time_s[first] - (last - first) * period
+        late_s = time_s[last] - time_s[first] - (last - first) * period_s
         lacks[long[late_s <= _PERMANENT * excess_s]] = False
     return lacks
 
 
-def without_stalls(time_s: np.ndarray, period: float, shortest_s: float) -> np.ndarray:
+def without_stalls(time_s: np.ndarray, period_s: float, shortest_s: float) -> np.ndarray:
     """
     Return stamps, s, (n,), as they were without stalls of a host of some time, s, or more.
 
     What waited came at once: it is evenly spaced from the sample before.
     """
     mended_s = time_s.copy()
-    lag_s = time_s - period * np.arange(len(time_s))
-    is_stall = (np.diff(time_s) > period + shortest_s) & ~lacks_samples(time_s, period)
+    lag_s = time_s - period_s * np.arange(len(time_s))
+    is_stall = (np.diff(time_s) > period_s + shortest_s) & ~lacks_samples(time_s, period_s)
     for i in np.flatnonzero(is_stall).tolist():
-        usual_s = mended_s[i] - period * i + period / 2
+        usual_s = mended_s[i] - period_s * i + period_s / 2
         stop = i + 1
         while stop < len(time_s) and lag_s[stop] > usual_s:
             stop += 1
-        mended_s[i + 1 : stop] = mended_s[i] + period * np.arange(1, stop - i)
+        mended_s[i + 1 : stop] = mended_s[i] + period_s * np.arange(1, stop - i)
     return mended_s
 
 
-def period_s(time_s: np.ndarray) -> float:
+def mean_period_s(time_s: np.ndarray) -> float:
     """Return the mean period of two or more stamps, s, (n,); 0 where they stand still."""
     ends = burst_ends(time_s)
     if len(ends) < 2:
         ends = np.array([0, len(time_s) - 1])
     lag = max(min(_LAG, (len(ends) - 1) // 4), 1)
-    period = float(
+    period_s = float(
         np.median((time_s[ends[lag:]] - time_s[ends[:-lag]]) / (ends[lag:] - ends[:-lag]))
     )
     # From the end of a burst to the end of another one, so that all of them are whole.
     whole_s = time_s[ends[0] : ends[-1] + 1]
     steps_s = np.diff(whole_s)
     for _ in range(_ROUNDS):
-        if not period > 0:
+        if not period_s > 0:
             break
-        complete = ~lacks_samples(whole_s, period)
+        complete = ~lacks_samples(whole_s, period_s)
         if not complete.any():
             break
-        before = period
-        period = float(steps_s[complete].mean())
-        if period == before:
+        before = period_s
+        period_s = float(steps_s[complete].mean())
+        if period_s == before:
             break
-    return max(period, 0.0)
+    return max(period_s, 0.0)
 
 
 def stamped_rate_hz(time_s: np.ndarray) -> float:
     """Return the sample rate of two or more stamps, s, (n,), Hz, to 1e-6; NaN where they stand."""
-    step_s = period_s(time_s)
+    step_s = mean_period_s(time_s)
     return round(1 / step_s, 6) if step_s > 0 else float('nan')
 
 
 def is_even(time_s: np.ndarray) -> bool:
     """Return whether nearly all steps of stamps, s, (n,), are one period."""
-    step_s = period_s(time_s)
+    step_s = mean_period_s(time_s)
     deviation_s = np.quantile(np.abs(np.diff(time_s) - step_s), _EVEN_QUANTILE)
     return bool(deviation_s <= _EVEN_DEVIATION * step_s)
 
@@ -170,7 +171,7 @@ def halves(time_s: np.ndarray) -> Halves:
 
 def late_by(stamps: np.ndarray) -> np.ndarray:
     """Return by how much each stamp, (n,), is earlier than the latest one before it; 0 if not."""
-    return np.asarray(np.maximum.accumulate(stamps) - stamps)
+    return np.maximum.accumulate(stamps) - stamps
 
 
 def describe_bursts(time_s: np.ndarray) -> str:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -26,6 +26,11 @@ class _Quantity:
     longest_s: float = 0.0  # Longest time from a value to a sample without one, s
     _last: float = np.nan  # The newest value, and its stamp, s
     _last_s: float = np.nan
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a value."""
+        return self.unknown < self.samples
 
     def filled(self, time_s: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the values, (n,): each holds until the next one, the nominal one before all."""
@@ -80,61 +85,52 @@ class Surroundings:
 
     def assumed(self, effects: Iterable[str]) -> list[str]:
         """Return what is assumed of what the named effects follow, one line each, for people."""
-        lines = []
+        lines = self._unknown(effects)
         for name, quantity, names in self._followed(effects):
-            if quantity.unknown:
+            if quantity.is_known and quantity.unknown:
                 lines.append(
                     f'{name} is missing before its first value, in {quantity.unknown} of '
                     f'{quantity.samples} samples: {names} at {quantity.nominal:g} '
                     f'{column_unit(name)} there'
                 )
-            if quantity.missing:
+            if quantity.is_known and quantity.missing:
                 lines.append(
                     f'{name} is missing in {quantity.missing} of {quantity.samples} '
                     f'samples, for {quantity.longest_s:.3g} s at most: the value before '
                     'holds'
                 )
-        return [*self._unknown(effects), *lines]
+        return lines
 
     def interpolated(self, effects: Iterable[str]) -> list[str]:
         """Return the same where missing values are interpolated over the whole recording."""
-        return [
-            *self._unknown(effects),
-            *(
-                f'{name} is missing in {quantity.missing + quantity.unknown} of '
-                f'{quantity.samples} samples: it is interpolated, and the nearest value holds '
-                'at the ends'
-                for name, quantity, _ in self._followed(effects)
-                if quantity.missing + quantity.unknown
-            ),
-        ]
-
-    def _followed(self, effects: Iterable[str]) -> list[_Followed]:
-        """Return what has values."""
-        names = _followers(effects)
-        return [
-            _Followed(name, quantity, names[name])
-            for name, quantity in self._quantities.items()
-            if name in names and quantity.unknown < quantity.samples
-        ]
+        lines = self._unknown(effects)
+        for name, quantity, _ in self._followed(effects):
+            missing = quantity.missing + quantity.unknown
+            if quantity.is_known and missing:
+                lines.append(
+                    f'{name} is missing in {missing} of {quantity.samples} samples: it is '
+                    'interpolated, and the nearest value holds at the ends'
+                )
+        return lines
 
     def _unknown(self, effects: Iterable[str]) -> list[str]:
         """Return what is assumed for the whole recording, one line each."""
-        names = _followers(effects)
-        power_on = (
-            [f'{names["time_s"]}: as if the sensor was switched on at the first sample']
-            if 'time_s' in names
-            else []
-        )
-        return [
-            *power_on,
-            *(
-                f'{name} is not recorded: {names[name]} at {quantity.nominal:g} '
-                f'{column_unit(name)}'
-                for name, quantity in self._quantities.items()
-                if name in names and quantity.unknown == quantity.samples
-            ),
-        ]
+        lines = []
+        if since_power_on := _followers(effects).get('time_s'):
+            lines.append(f'{since_power_on}: as if the sensor was switched on at the first sample')
+        for name, quantity, names in self._followed(effects):
+            if not quantity.is_known:
+                lines.append(
+                    f'{name} is not recorded: {names} at {quantity.nominal:g} {column_unit(name)}'
+                )
+        return lines
+
+    def _followed(self, effects: Iterable[str]) -> Iterator[_Followed]:
+        """Yield what the named effects follow."""
+        followers = _followers(effects)
+        for name, quantity in self._quantities.items():
+            if name in followers:
+                yield _Followed(name, quantity, followers[name])
 
 
 def _followers(effects: Iterable[str]) -> dict[str, str]:

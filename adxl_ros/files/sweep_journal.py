@@ -21,6 +21,11 @@ FORMAT = 1
 """Version of the format, in the head of each journal; raised with each change of the lines."""
 
 
+def _with_tuples(line: Mapping[str, Any]) -> dict[str, Any]:
+    """Return keys and values of a line with tuples in place of lists."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in line.items()}
+
+
 @dataclass(frozen=True, kw_only=True)
 class PoseRecord:
     """One accepted pose: the mean output at rest and the joint angles."""
@@ -51,7 +56,7 @@ class PoseRecord:
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:
         """Read the record of a line."""
-        return cls(**{**line, 'mean_v': tuple(line['mean_v']), 'std_v': tuple(line['std_v'])})
+        return cls(**_with_tuples(line))
 
 
 @dataclass(frozen=True)
@@ -139,10 +144,8 @@ _ENTRIES: Mapping[str, Callable[[Any], JournalEntry]] = {
     'drop': lambda line: PoseDropped(line['drop']),
     'mounting': lambda line: MountingUnchecked(),
     'rests': lambda line: Fitted(tuple(map(PoseRecord.from_json, line['rests'])), line['done']),
-    'stay': lambda line: NaturalRest(
-        **{**line, 'mean_v': tuple(line['mean_v']), 'std_v': tuple(line['std_v'])}
-    ),
-    'values': lambda line: Adopted(**{**line, 'values': tuple(line['values'])}),
+    'stay': lambda line: NaturalRest(**_with_tuples(line)),
+    'values': lambda line: Adopted(**_with_tuples(line)),
     'undone_ns': lambda line: Undone(**line),
 }
 """What makes an entry of a line, by the first of these keys that the line has."""
@@ -164,14 +167,25 @@ class JournalContents(NamedTuple):
     size: int  # Size of the lines, bytes, without one that a crash has cut
     damage: str  # Which line is none of a journal, and why; empty if all are
 
+    @property
+    def has_fit(self) -> bool:
+        """Whether the last entry is a fit."""
+        return bool(self.entries) and isinstance(self.entries[-1], Fitted)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the last entry is a fit without open poses, and no line is damaged."""
+        last = self.entries[-1] if self.entries else None
+        return isinstance(last, Fitted) and last.done and not self.damage
+
     def is_over(self, head: Mapping[str, Any]) -> bool:
         """
         Return whether the calibration is over, so that another may begin.
 
         One that was fitted with open poses can be resumed. For another head it is over.
         """
-        last = self.entries[-1] if self.entries else None
-        return isinstance(last, Fitted) and (last.done or bool(differences(self.head, head)))
+        is_of_other = self.has_fit and bool(differences(self.head, head))
+        return self.is_finished or is_of_other
 
 
 class Unfinished(NamedTuple):
@@ -235,14 +249,12 @@ class Journal:
                 'file is kept)'
             )
         is_new = not found.head and not found.damage
-        if not is_new and (start_over or found.is_over(head)):
+        is_over = start_over or found.is_over(head)
+        if is_over and not is_new:
             # A finished journal is kept until the next one is finished, others for ever.
-            last = found.entries[-1] if found.entries else None
-            name = (
-                'previous'
-                if isinstance(last, Fitted) and last.done and not found.damage
-                else datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
-            )
+            name = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
+            if found.is_finished:
+                name = 'previous'
             with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as copy:
                 shutil.copyfile(self.path, copy)
             is_new = True
@@ -334,7 +346,8 @@ def _parse(path: Path) -> JournalContents:
     head: dict[str, Any] = {}
     entries: list[JournalEntry] = []
     # A crash may have left the beginning of the head, or its length without its bytes.
-    if b'\n' not in data and data.strip(b'\0') and not data.startswith(b'{'):
+    begins_otherwise = data.strip(b'\0') and not data.startswith(b'{')
+    if b'\n' not in data and begins_otherwise:
         return JournalContents(
             head, entries, 0, 'line 1 is not of a journal (it does not begin with {)'
         )

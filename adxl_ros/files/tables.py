@@ -47,6 +47,15 @@ _MAPPINGS = {
     'vehicle_acceleration': 'time={time}:us,x=xyz[0]:mps2,y=xyz[1]:mps2,z=xyz[2]:mps2',
 }
 """Columns and units of messages by the definitions of PX4 (msg/*.msg), the raw readings first."""
+_MATLAB = (
+    "save plain vectors with save('run.mat', 't', 'x', 'y', 'z', '-v7'), or a "
+    "table with writetable(T, 'run.csv')"
+)
+"""How MATLAB writes what can be read, for messages: no struct, timetable or HDF5 (-v7.3)."""
+_POSE_COLUMNS = ('alpha_deg', 'beta_deg')  # Columns of a table of poses
+_TILT_COLUMNS = ('roll_deg', 'pitch_deg')  # The same by an inclinometer
+_SPAN_COLUMNS = ('start_s', 'stop_s')  # When a pose rests; a table may have both or none
+_LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
 def open_table(path: AnyPath, topic: str = '') -> Table:
@@ -126,18 +135,12 @@ def _library(path: str, kind: str, package: str) -> Iterator[None]:
 
 
 def _open_numpy(path: str) -> Table:
+    """Open an array, or a file of arrays, of NumPy."""
     with _library(path, 'plain arrays of NumPy', 'numpy'):
         loaded = np.load(path, allow_pickle=False)
         names = getattr(loaded, 'files', None) or loaded.dtype.names
         arrays = {name: loaded[name] for name in names} if names else {'column': loaded}
         return _of_arrays(path, arrays, 'save each column as an array')
-
-
-_MATLAB = (
-    "save plain vectors with save('run.mat', 't', 'x', 'y', 'z', '-v7'), or a "
-    "table with writetable(T, 'run.csv')"
-)
-"""How MATLAB writes what can be read, for messages: no struct, timetable or HDF5 (-v7.3)."""
 
 
 def _open_mat(path: str) -> Table:
@@ -152,7 +155,8 @@ def _of_arrays(path: str, arrays: Mapping[str, Any], advice: str) -> Table:
     columns: dict[str, np.ndarray] = {}
     for name, values in arrays.items():
         values = np.asarray(values)
-        if values.dtype.kind in 'iuf' and values.ndim in (1, 2) and values.size > 1:
+        is_table = values.ndim in (1, 2) and values.size > 1
+        if is_table and values.dtype.kind in 'iuf':
             series = np.atleast_2d(values)
             if series.shape[0] > series.shape[1]:
                 series = series.T  # MATLAB and others keep a vector as a row
@@ -161,7 +165,7 @@ def _of_arrays(path: str, arrays: Mapping[str, Any], advice: str) -> Table:
             }
     if not columns:
         raise UserError(f'{path}: holds no array of numbers with several rows; {advice}')
-    rows = Counter(map(len, columns.values())).most_common(1)[0][0]
+    [(rows, _)] = Counter(map(len, columns.values())).most_common(1)
     return in_memory(
         path, {name: values for name, values in columns.items() if len(values) == rows}
     )
@@ -269,13 +273,6 @@ _FORMATS: Mapping[str, Callable[[str], Table]] = {
 """Formats besides text and logs by the ends of their files' names."""
 
 TABLE_ENDINGS = (*_FORMATS, '.ulg')  # Ends of the names of tables that are no text
-
-
-_POSE_COLUMNS = ('alpha_deg', 'beta_deg')  # Columns of a table of poses
-_TILT_COLUMNS = ('roll_deg', 'pitch_deg')  # The same by an inclinometer
-_SPAN_COLUMNS = ('start_s', 'stop_s')  # When a pose rests; a table may have both or none
-
-_LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
 class PoseTable(NamedTuple):

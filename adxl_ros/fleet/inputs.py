@@ -24,7 +24,8 @@ from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import NO_SERIAL, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.files.tables import TABLE_ENDINGS
 from adxl_ros.fleet.row import as_date, TABLE
 from adxl_ros.report.page import as_utf_8, without_secrets

@@ -25,7 +25,8 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.calibration_store import sha256
-from adxl_ros.files.recording_columns import NO_SERIAL, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.fleet import inputs
@@ -438,7 +439,8 @@ class _Job:
 
         found = diagnose(self._recording, self._params)
         # The report names the file, and not the copy of the task.
-        found = found.with_params(self._parameters.name if self._params else '')
+        params = self._parameters.name if self._params else ''
+        found = replace(found, compared=found.compared.with_params(params))
         self._put_assumed(found.sensor)
         self._put_verdict(found.to_dict())
         self.files |= {

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import accumulate, chain, count
 import os
@@ -320,9 +320,8 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     answer, gap = run_round(question, recordings, sensor, limits, seed)
     if gap is not None:
         # The page is that of the end.
-        texts = gap.with_params(str(folder.baseline)).documents(
-            folder.path, has_page=answer.outcome is not RoundOutcome.GO_ON
-        )
+        gap = replace(gap, compared=gap.compared.with_params(str(folder.baseline)))
+        texts = gap.documents(folder.path, has_page=answer.outcome is not RoundOutcome.GO_ON)
         for name, text in texts.items():
             write_text(folder.path / name, text)
     return answer

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import Recording, REFERENCES, uncalibrated
+from adxl_ros.files.recording_columns import Recording, REFERENCES
+from adxl_ros.files.stream_info import uncalibrated
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
 import numpy as np

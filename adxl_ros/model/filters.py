@@ -19,17 +19,22 @@ _STIFF = 8.0  # |z| from which weights are integrated by parts; chosen: stable t
 
 
 def low_pass(
-    x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any], may_step: bool = False
+    x: np.ndarray,
+    tau_s: float,
+    dt_s: float,
+    memory: dict[str, Any],
+    may_step: bool = False,
+    every: int = 1,
 ) -> np.ndarray:
     """
     Filter inputs, (n,), by 1/(1 + τ·s); τ = 0 passes them on.
 
     Before the first block, with an empty memory, the filter is at rest at its first input.
-    may_step: see `pole`.
+    may_step, every: see `pole`.
     """
     if not tau_s:
-        return x
-    return pole(x, -1 / tau_s, dt_s, memory, may_step) / tau_s
+        return x[::every]
+    return pole(x, -1 / tau_s, dt_s, memory, may_step, every) / tau_s
 
 
 def resonator(
@@ -47,7 +52,12 @@ def resonator(
 
 
 def pole(
-    x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any], may_step: bool = False
+    x: np.ndarray,
+    rate: complex,
+    dt_s: float,
+    memory: dict[str, Any],
+    may_step: bool = False,
+    every: int = 1,
 ) -> np.ndarray:
     """
     Solve w' = rate·w + x, exactly for x a polynomial through the newest `ORDER` samples.
@@ -59,26 +69,25 @@ def pole(
 
     may_step: whether inputs may step. A polynomial rings there, so that the newest two inputs are
     then joined by a straight line.
+    every: of one series in a single block, each k-th output can be had alone, from the first on.
     """
     if not len(x):
         return x
-    first = not memory
-    previous = memory['inputs'] if memory else np.repeat(x[:1], ORDER - 1, axis=0)
+    decay = np.exp(rate * dt_s)
+    # What drives an output has decayed at the next one.
+    weights = np.convolve(_weights(rate * dt_s, ORDER) * dt_s, decay ** np.arange(every))
+    previous = memory['inputs'] if memory else np.repeat(x[:1], len(weights) - 1, axis=0)
     last_w = memory.get('w', -x[0] / rate)
     inputs = np.concatenate([previous, x])
-    weights = _weights(rate * dt_s, ORDER) * dt_s
     if may_step:
         drive = _stepping(inputs, _step_rows(rate * dt_s, dt_s))
     elif x.ndim == 1:
-        drive = np.convolve(inputs, weights, 'valid')
+        drive = np.convolve(inputs, weights, 'valid')[::every]
     else:
         drive = sum(
             weight * inputs[ORDER - 1 - j : len(inputs) - j] for j, weight in enumerate(weights)
         )
-    decay = np.exp(rate * dt_s)
-    if first:
-        drive[0] = -x[0] / rate * (1 - decay)
-    w = first_order_recursion(1.0, decay, drive, last_w)
+    w = first_order_recursion(1.0, decay**every, drive, last_w)
     memory['inputs'], memory['w'] = inputs[-(ORDER - 1) :], w[-1]
     return w
 

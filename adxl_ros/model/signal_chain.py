@@ -199,7 +199,7 @@ class Chain:
         """Run the ADC on `input_v`; return volts, (..., m)."""
         self(Place.ADC, signals)
         coded = quantise(
-            np.stack(signals.volts, axis=-1),
+            np.moveaxis(np.array(signals.volts), 0, -1),
             self.sensor,
             signals.lsb_v * np.array(signals.lsb_ratio),
         )
@@ -207,7 +207,7 @@ class Chain:
             return coded
         signals.volts = [coded[..., d] for d in range(coded.shape[-1])]
         self(Place.CODE, signals)
-        return np.stack(signals.volts, axis=-1)
+        return np.moveaxis(np.array(signals.volts), 0, -1)
 
 
 def static_chain(sensor: Sensor) -> Chain:

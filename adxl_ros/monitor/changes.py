@@ -323,8 +323,10 @@ def _diagnose(folder: Path, given: DiagnosisInput) -> DiagnosisResult:
             epoch_ns=samples.epoch_ns,
         )
         recording.write(ideal.path, ideal, given.sensor)
-    gap = diagnose(samples, given.sensor, sim=ideal).with_params(str(baseline))
-    page, *_ = gap.save(folder, gap.command(folder / 'again'))
+    gap = diagnose(samples, given.sensor, sim=ideal)
+    compared = gap.compared.with_params(str(baseline))
+    gap = replace(gap, compared=compared)
+    page, *_ = gap.save(folder, compared.command(folder / 'again'))
     certain = tuple(effect.name for effect in gap.effects if not effect.rivals)
     likely = tuple(effect.name for effect in gap.effects)
     return DiagnosisResult(True, gap.summary, str(page), certain or likely, gap.probability)

@@ -7,15 +7,10 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 
-from adxl_ros.files.recording_columns import (
-    ACCEL,
-    JOINTS,
-    LONGEST_MOVE_NS,
-    Recording,
-    sensor_info,
-    Track,
-)
+from adxl_ros.files.recording_columns import ACCEL, JOINTS, Recording
+from adxl_ros.files.reference_track import LONGEST_MOVE_NS, Track
 from adxl_ros.files.stamps import stamped_rate_hz
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named

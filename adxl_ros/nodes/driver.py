@@ -10,7 +10,7 @@ import traceback
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files.recording_columns import NO_SERIAL
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters

@@ -16,7 +16,7 @@ from adxl_ros.calibrate.keep.stays import RestStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import make_folder
-from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, StreamInfo
+from adxl_ros.files.stream_info import check_same_sensor, NO_SERIAL, StreamInfo
 from adxl_ros.files.sweep_journal import Journal, NaturalRest, read
 from adxl_ros.model.sensor import get, put, Sensor, to_volts
 from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters, topics

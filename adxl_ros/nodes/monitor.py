@@ -11,7 +11,7 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, nominal_of, StreamInfo
+from adxl_ros.files.stream_info import check_same_sensor, NO_SERIAL, nominal_of, StreamInfo
 from adxl_ros.links.support.base import COLUMNS
 from adxl_ros.monitor import changes
 from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time

@@ -10,7 +10,8 @@ import math
 from typing import Any
 
 from adxl_ros.files import cdr
-from adxl_ros.files.recording_columns import JOINTS, sensor_info
+from adxl_ros.files.recording_columns import JOINTS
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support.base import Samples
 from adxl_ros.model.covariance import imu_covariance
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2

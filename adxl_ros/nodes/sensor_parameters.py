@@ -118,7 +118,7 @@ def anonymous_sensor(node: Node, flat: Mapping[str, Any]) -> Sensor:
     """Return the sensor of a stream that states nothing of itself."""
     if is_from_file(node):
         return make_sensor(flat, may_measure=True)
-    any_imu = parameter_file.load(parameter_file.any_imu_path(), may_measure=True)
+    any_imu = parameter_file.usual(is_nominal=False)
     given = {name: flat[name] for name in given_parameters(node) if name in flat}
     return make_sensor(parameter_file.to_flat(any_imu) | given, may_measure=True)
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr, imu_message
-from adxl_ros.files.recording_columns import StreamInfo
+from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.nodes.parameter_checks import QOS_POLICIES
 from adxl_ros.nodes.parameters import SI
 from adxl_ros.report.level import Level

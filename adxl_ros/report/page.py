@@ -27,6 +27,15 @@ from adxl_ros.report.figures import png
 _DPI = 100  # Resolution of pictures, dots per inch (chosen: sharp at the page's width)
 _GZIP_LEVEL = 6
 """Level of compression (chosen: 0.3 s for plotly.js; level 9 takes three times as long)."""
+_PASSWORD = re.compile(r'(?<=://)([^/@:\s]*):[^/@\s]*@')  # User and password of an address
+_QUERY = re.compile(r'(?<=://)([^\s?#\'"]*)\?([^\s#\'"]*)')  # Place and query of an address
+_SECRET = re.compile(
+    r'x-(amz|goog)-|token|[-_]key|key-pair|(api|access)key|secret|signature|passw|pwd|credential'
+    r'|jwt|auth(?!ors?$)|googleaccessid'
+    r'|^(sig|expires|policy|s([evsprt]|pr|rt|ip|k[tesv]|dd|es)|s[ak]oid|suoid|sktid|scid)$',
+    re.IGNORECASE,
+)
+"""Part of a parameter's name that is secret, or belongs to a signature of S3, Google or Azure."""
 
 
 def check_libraries() -> None:
@@ -73,17 +82,6 @@ def picture_url(figure: Any) -> str:
 def download_url(text: str) -> str:
     """Return a text as the URL of a file that the page offers for download."""
     return f'data:application/yaml;base64,{b64encode(text.encode()).decode()}'
-
-
-_PASSWORD = re.compile(r'(?<=://)([^/@:\s]*):[^/@\s]*@')  # User and password of an address
-_QUERY = re.compile(r'(?<=://)([^\s?#\'"]*)\?([^\s#\'"]*)')  # Place and query of an address
-_SECRET = re.compile(
-    r'x-(amz|goog)-|token|[-_]key|key-pair|(api|access)key|secret|signature|passw|pwd|credential'
-    r'|jwt|auth(?!ors?$)|googleaccessid'
-    r'|^(sig|expires|policy|s([evsprt]|pr|rt|ip|k[tesv]|dd|es)|s[ak]oid|suoid|sktid|scid)$',
-    re.IGNORECASE,
-)
-"""Part of a parameter's name that is secret, or belongs to a signature of S3, Google or Azure."""
 
 
 def without_secrets(text: str) -> str:

@@ -16,7 +16,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import gap_s, smallest_change
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange
-from adxl_ros.signals.rest_detection import Rest
+from adxl_ros.signals.rest_search import Rest
 import numpy as np
 
 _MOST_CELLS = 1 << 17
@@ -26,6 +26,16 @@ _AT_ONCE = 1 << 14
 """Samples that are read at a time: with three axes 400 kB, which stay in the cache of a core."""
 _FEWEST_AVERAGES = 3
 """Averages side by side at the longest time: with two there is one difference and no scatter."""
+_WINDOW_S = 2.0
+"""Shortest window of the standard deviation of a sample, s. It holds the slowest usual filters,
+0.3 s, several times; drift of longer windows would count as noise of a sample."""
+_LARGEST_END_S = 0.2
+"""Longest time beside a rest that is no motion, s: four blocks, which a rest may lose there."""
+_FEWEST_SAMPLES = 512
+"""Fewest samples at rest: white noise is then known within 10 % at 90 %, with half within 15 %."""
+SHORTEST_S = 10.0
+"""Shortest rest, s. Bias instability shows from averages of one second on, of which ten are few;
+half of it would leave no octave above one second with three averages."""
 
 
 @dataclass(frozen=True)
@@ -120,18 +130,6 @@ class Cells(NamedTuple):
     means: np.ndarray  # Mean of each cell by axis, (k, m)
 
 
-_WINDOW_S = 2.0
-"""Shortest window of the standard deviation of a sample, s. It holds the slowest usual filters,
-0.3 s, several times; drift of longer windows would count as noise of a sample."""
-_LARGEST_END_S = 0.2
-"""Longest time beside a rest that is no motion, s: four blocks, which a rest may lose there."""
-_FEWEST_SAMPLES = 512
-"""Fewest samples at rest: white noise is then known within 10 % at 90 %, with half within 15 %."""
-SHORTEST_S = 10.0
-"""Shortest rest, s. Bias instability shows from averages of one second on, of which ten are few;
-half of it would leave no octave above one second with three averages."""
-
-
 @dataclass(frozen=True)
 class StillStretch:
     """
@@ -208,7 +206,6 @@ def longest_rest(
             f'{first.path}: rests for {rest.span_s:.4g} s at most, expected '
             f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor'
         )
-    span_s = last_s - first_s
     with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as gyro_file:
         samples = _Samples(first, first.sensor_columns, file)
         turns = _Samples(first, GYRO, gyro_file)
@@ -218,20 +215,20 @@ def longest_rest(
             if gyro_radps is not None:
                 is_taken = np.isfinite(gyro_radps).all(axis=1)
                 turns.feed(block.time_s[is_taken], gyro_radps[is_taken], rest)
+        span_s = last_s - first_s
         accelerometer = samples.stretch(span_s, motion_s, beyond.describe(nominal))
-        gyroscope = None
-        doubt = ''
-        if 0 < turns.count < accelerometer.count:
+        if not turns.count:
+            return StillSensors(accelerometer, None)
+        if turns.count < accelerometer.count:
             doubt = (
                 f'the gyroscope has {turns.count} readings at rest, and the accelerometer '
                 f'{accelerometer.count}: it is left out'
             )
-        elif turns.count:
-            try:
-                gyroscope = turns.stretch(span_s, motion_s, '')
-            except UserError as error:
-                doubt = f'the gyroscope is left out: {error}'
-        return StillSensors(accelerometer, gyroscope, doubt)
+            return StillSensors(accelerometer, None, doubt)
+        try:
+            return StillSensors(accelerometer, turns.stretch(span_s, motion_s, ''))
+        except UserError as error:
+            return StillSensors(accelerometer, None, f'the gyroscope is left out: {error}')
 
 
 def longest_of(

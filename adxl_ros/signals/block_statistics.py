@@ -25,6 +25,21 @@ BLOCK_S = 0.05  # Length of a block, s. Chosen: far below a rest, above most sam
 _GAP_S = 0.1  # Smallest time without a sample that ends a block, s. Chosen: two blocks
 _GAP_PERIODS = 5  # Smallest gap, sample periods. Chosen: a few lost samples are none
 _CHUNK = 1 << 13  # Rows that are processed at once. Chosen: they fit into the cache
+_WINDOW_S = 0.25  # Length of the window of a variance, s. Chosen: under half of the shortest rest
+_WINDOW_SAMPLES = 8  # Fewest samples of that window. Chosen: fewer show no variance
+_HALF_S = 0.5  # Shortest halves whose means are compared, s. Chosen: two windows
+DRIFT_OCTAVES = 4  # Lengths of halves: 0.5, 1, 2, 4 s. Chosen: beyond, flicker dominates
+MIN_VARIANCE_RATIO = 2.25  # Smallest limit of a variance, by that of noise: 1.5 times its rms
+_MAX_VARIANCE_RATIO = 9.0  # Largest limit of a variance, by that of noise: 3 times its rms
+_QUIETEST_SHARE = 0.05  # Quantile of variances at which the search for noise begins
+_QUIET_RATIO = 3.0  # Largest variance of a quiet window, relative to that of the noise
+_QUIET_STEPS = 50  # Largest number of steps of that search
+_QUIET_DEVIATIONS = 5.0  # Distance of the limit from the noise, stds of ln(variance)
+_ROUNDING = 1e-9  # Relative rounding error of samples without noise
+_CONSTANT_SHARE = 0.25
+"""Share of the windows in which the others rest, above which an axis is constant by its steps.
+Chosen: far below all of them. Where the others never rest, axes are stuck or clipped in turn."""
+_TINY_VARIANCE = 1e-300  # Lower bound of a variance, for its logarithm
 
 
 def gap_s(rate_hz: float) -> float:
@@ -119,6 +134,7 @@ class BlockCutter:
         return blocks
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
+        """Return the blocks that begin at some rows, (k,), with their runs, (k,)."""
         block = columns[:, start[:, None] + np.arange(self.size)]
         samples = block[1 : 1 + self._axes]
         angles = block[1 + self._axes :]
@@ -174,23 +190,6 @@ def held_values(values: np.ndarray, known: np.ndarray, before: float = np.nan) -
     """Hold each known value until the next one, (n,); `before` is the value before the first."""
     last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
     return np.where(last >= 0, values[last], before)
-
-
-_WINDOW_S = 0.25  # Length of the window of a variance, s. Chosen: under half of the shortest rest
-_WINDOW_SAMPLES = 8  # Fewest samples of that window. Chosen: fewer show no variance
-_HALF_S = 0.5  # Shortest halves whose means are compared, s. Chosen: two windows
-DRIFT_OCTAVES = 4  # Lengths of halves: 0.5, 1, 2, 4 s. Chosen: beyond, flicker dominates
-MIN_VARIANCE_RATIO = 2.25  # Smallest limit of a variance, by that of noise: 1.5 times its rms
-_MAX_VARIANCE_RATIO = 9.0  # Largest limit of a variance, by that of noise: 3 times its rms
-_QUIETEST_SHARE = 0.05  # Quantile of variances at which the search for noise begins
-_QUIET_RATIO = 3.0  # Largest variance of a quiet window, relative to that of the noise
-_QUIET_STEPS = 50  # Largest number of steps of that search
-_QUIET_DEVIATIONS = 5.0  # Distance of the limit from the noise, stds of ln(variance)
-_ROUNDING = 1e-9  # Relative rounding error of samples without noise
-_CONSTANT_SHARE = 0.25
-"""Share of the windows in which the others rest, above which an axis is constant by its steps.
-Chosen: far below all of them. Where the others never rest, axes are stuck or clipped in turn."""
-_TINY_VARIANCE = 1e-300  # Lower bound of a variance, for its logarithm
 
 
 class Spans:
@@ -275,7 +274,7 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
 
 def smallest_change(changes: np.ndarray) -> np.ndarray:
     """Return the smallest change that is not 0 by axis, (n, m) to (m,); inf where none is."""
-    return np.asarray(np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
+    return np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf)
 
 
 def adc_step(blocks: Blocks) -> np.ndarray:

@@ -13,9 +13,11 @@ from typing import Any
 from adxl_ros.report import page as html_page
 from adxl_ros.report.quantities import column_unit, counted, duration, short_time
 from adxl_ros.report.screen import COLUMNS, row, wrapped
-from adxl_ros.signals.findings import Findings, RecordingContents
+from adxl_ros.signals.axis_ranges import AxisRange
+from adxl_ros.signals.findings import Findings
 from adxl_ros.signals.gate import Outcome
 from adxl_ros.signals.gyroscope_turns import GyroFindings
+from adxl_ros.signals.recording_contents import RecordingContents
 import numpy as np
 
 PAGE = 'check.html'  # Name of the page in the folder of the report
@@ -25,6 +27,8 @@ HEAD = ('recording', 'length', 'rate', 'missing', 'rest', 'axes', 'verdict')
 _COLUMNS = (_NAME_COLUMNS, '>12', '>12', '>8', '>8', '>6', 11)
 _SHOWS_HEAD = ('effect', 'from', 'typical', '')
 _SHOWS_COLUMNS = (24, 16, 14)
+_NOT_IN_CONTENTS = ('path', 'remarks', 'cut', 'gravity', 'neighbour_faults')
+"""Fields of the contents that have another place in the JSON."""
 
 
 def screen_lines(results: Sequence[Findings]) -> list[str]:
@@ -120,11 +124,11 @@ def gate_lines(outcomes: Sequence[Sequence[Outcome]], against: str) -> list[str]
 
 
 def _value_lines(contents: RecordingContents) -> list[str]:
+    """Return the figures of a recording, one line each."""
     texts = [
         f'{contents.samples} samples, jitter {short_time(contents.jitter_s)} rms',
         ', '.join(
-            f'{axis.name} {axis.lowest_mps2:.3g} to {axis.highest_mps2:.3g} m/s²'
-            for axis in contents.axes
+            f'{axis.name} {axis.lowest:.3g} to {axis.highest:.3g} m/s²' for axis in contents.axes
         ),
         *(
             f'{name} {low:.4g} to {high:.4g} {column_unit(name)}'
@@ -173,6 +177,18 @@ def page(results: Sequence[Findings], badge: Mapping[str, Any]) -> str:
     )
 
 
+def _axis_as_json(axis: AxisRange) -> dict[str, Any]:
+    """Return the range of an axis of the sensor's output."""
+    return {
+        'name': axis.name,
+        'lowest_mps2': axis.lowest,
+        'highest_mps2': axis.highest,
+        'clipped': axis.clipped,
+        'is_stuck': axis.is_stuck,
+        'stuck_s': axis.stuck_s,
+    }
+
+
 def as_json(result: Findings, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """Return what was found in a recording, as `check --json` prints it."""
     values: dict[str, Any] = {}
@@ -180,8 +196,9 @@ def as_json(result: Findings, outcomes: Sequence[Outcome]) -> dict[str, Any]:
         values = {
             name: value
             for name, value in asdict(result.contents).items()
-            if name not in ('path', 'remarks', 'cut', 'gravity', 'neighbour_faults')
+            if name not in _NOT_IN_CONTENTS
         }
+        values['axes'] = [_axis_as_json(axis) for axis in result.contents.axes]
         values['gravity'] = result.contents.gravity.as_json()
         values['bad_stamps'] = result.contents.bad_stamps._asdict()
     return {

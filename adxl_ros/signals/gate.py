@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 from adxl_ros.errors import UserError
@@ -22,11 +23,14 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
-from adxl_ros.signals.findings import Findings, RecordingContents
 from adxl_ros.signals.recorded_sensor import load_sensor
-from adxl_ros.signals.rest_detection import RecordedRests
+from adxl_ros.signals.rest_detection import rests_of
 import numpy as np
 import scipy
+
+if TYPE_CHECKING:
+    from adxl_ros.signals.findings import Findings
+    from adxl_ros.signals.recording_contents import RecordingContents
 
 KINDS = ('sound', 'gaps', 'rate', 'noise', 'zero-g', 'rests')
 """What may fail: whether a recording is sound, and what is compared with an earlier one."""
@@ -166,6 +170,7 @@ def _events(name: str, new: RecordingContents, old: RecordingContents) -> Outcom
 
 
 def _rate(new: RecordingContents, old: RecordingContents) -> Outcome:
+    """Compare the sample rates, which the jitter of the stamps makes uncertain."""
     ratio = new.rate_hz / old.rate_hz
     # The first and the last stamp of each recording scatter by its jitter.
     std = float(np.hypot(*(np.sqrt(2) * each.jitter_s / each.span_s for each in (new, old))))
@@ -219,12 +224,9 @@ def _ratio(low: float, high: float) -> str:
 def _at_rest(read: Recording, sensor: Sensor | str | None) -> _AtRest:
     """Return noise and lengths over the rests of a recording."""
     unit = recorded_nominal(load_sensor(sensor, read), read)
-    rests = RecordedRests(unit, read)
-    rests.feed(read)
-    rests.take()
     accel_mps2 = read.accel_mps2(unit)
-    found = rests.detected
-    samples = [accel_mps2[each.rest.includes(read.time_s)] for each in found]
+    rests = rests_of(unit, read)
+    samples = [accel_mps2[each.rest.includes(read.time_s)] for each in rests]
     count = -(-_FEWEST_PARTS // max(len(samples), 1))
     parts = []
     for each in samples:

@@ -12,8 +12,7 @@ than g in most poses, so that they have an upper limit only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from itertools import product
 from typing import Any
@@ -21,22 +20,14 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, TINY
-from adxl_ros.model.effects.base import Coefficient, NOMINAL_ENVIRONMENT
-from adxl_ros.model.sensor import get, Sensor, to_nominal_mps2
+from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, number
+from adxl_ros.signals.reading_units import AXIS_UNITS, ReadingUnit, UNITS
+from adxl_ros.signals.tolerances import calibrated_tolerance, nominal_tolerance, Tolerance
 import numpy as np
 
-_TYPICAL_TO_LARGEST = 2.0
-"""Largest departure of a part, by the typical one of its datasheet, where no maximum is stated: a
-typical value is that of one standard deviation, and nearly all parts are within two."""
-_UNSTATED_ZERO_G = 0.1  # Zero-g error where no datasheet states one, g. Chosen: above most sensors
-_UNSTATED_SCALE = 0.1  # Scale error where none is stated. Chosen: above most sensors
-_UNSTATED_ACROSS = 0.02  # Cross-axis sensitivity where none is stated: the usual one
-_CALIBRATED_STDS = 3.0  # Largest error of a fitted coefficient, in its standard deviations
-_SHIFT_IN_USE_G = 0.02  # Shift of the zero-g of a healthy unit since its calibration, g
-_CHANGE_IN_USE = 0.01  # Change of its scale factor: a typical drift over 30 K
-_TEMPERATURES_K = 25.0  # Distance from room temperature that a recording may have, K
 _NOISE_STDS = 5.0  # Largest error of a mean by noise, in its standard deviations
 _LOCAL_MPS2 = 0.03  # Half of the range of gravity on Earth, 9.78 to 9.83 m/s², rounded up
 _LARGEST_FALSE_SHARE = 0.25
@@ -68,110 +59,6 @@ class GravityFaultKind(Enum):
 
 
 @dataclass(frozen=True)
-class ReadingUnit:
-    """A unit in which readings may be in place of m/s²."""
-
-    name: str  # For people
-    gravity: float  # Number of this unit that gravity has
-    conversion: str = ''  # What converts it
-    # Options that state it, in place of a conversion
-    options: Mapping[str, Any] = field(default_factory=dict, compare=False)
-
-    @property
-    def symbol(self) -> str:
-        """Name of the unit in options and parameters; '' where it alone does not state it."""
-        return self.options.get('unit', '') if len(self.options) == 1 else ''
-
-    @property
-    def remedy(self) -> str:
-        """Return what states or converts it."""
-        return self.conversion or f'state it by {option(**self.options)}'
-
-
-_COUNTS_PER_G = [2**k for k in range(6, 19)]
-"""Counts of 1 g of digital sensors: from 6 bits of ±2 g to 20 bits of ±2 g, by powers of two."""
-
-UNITS = (
-    ReadingUnit('g', 1.0, options={'unit': 'g'}),
-    ReadingUnit('mg', 1e3, options={'unit': 'mg'}),
-    ReadingUnit('mm/s²', 1e3 * G0_MPS2, options={'unit': 'mmps2'}),
-    ReadingUnit('cm/s²', 1e2 * G0_MPS2, 'divide the readings by 100'),
-    ReadingUnit('ft/s²', G0_MPS2 / 0.3048, 'multiply the readings by 0.3048'),
-    ReadingUnit('m/s² divided by 1000', 1e-3 * G0_MPS2, 'multiply the readings by 1000'),
-    ReadingUnit('g divided by 1000', 1e-3, f'multiply the readings by {1e3 * G0_MPS2:g}'),
-    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, options={'unit': 'mps2'}),
-    *(
-        ReadingUnit(
-            f'counts of {count} per g', float(count), options={'unit': 'lsb', 'lsb_per_g': count}
-        )
-        for count in _COUNTS_PER_G
-    ),
-)
-"""Units in which readings may be, those of physics before counts."""
-
-AXIS_UNITS = [unit for unit in UNITS if unit.name in ('g', 'mg', 'mm/s²', 'm/s² divided by 1000')]
-"""Units that single axes are tried in. Counts are left out: one of them fits almost any length."""
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """By how much the readings of a sound sensor may be off, by axis."""
-
-    zero_g_mps2: np.ndarray  # Zero-g error, m/s², (m,)
-    scale: np.ndarray  # Relative error of the scale factor, (m,)
-    across: float  # Share of the force across an axis that it reads
-
-    def widest(self, axes: int) -> Tolerance:
-        """Return the tolerance of its worst axis for a number of axes."""
-        return Tolerance(
-            np.full(axes, self.zero_g_mps2.max()), np.full(axes, self.scale.max()), self.across
-        )
-
-
-def nominal_tolerance(sensor: Sensor) -> Tolerance:
-    """Return the tolerance of a sensor that is read by its nominal values."""
-    zero_g = _departure(sensor, 'bias', 'offset_v') / sensor.nominal_scale_v_per_g
-    scale = _departure(sensor, 'scale_factor', 'offset_v_per_g') / sensor.nominal_scale_v_per_g
-    across = _departure(sensor, 'cross_axis', 'linear')
-    return Tolerance(
-        G0_MPS2 * np.where(zero_g > 0, zero_g, _UNSTATED_ZERO_G),
-        np.where(scale > 0, scale, _UNSTATED_SCALE),
-        across or _UNSTATED_ACROSS,
-    )
-
-
-def _departure(sensor: Sensor, effect: str, parameter: str) -> float:
-    """Return the largest departure by the datasheet, in the unit of the parameter; 0 for none."""
-    typical, largest = sensor.datasheet.get(Coefficient(effect, parameter), (0.0, 0.0))
-    return largest or _TYPICAL_TO_LARGEST * typical
-
-
-def calibrated_tolerance(sensor: Sensor) -> Tolerance:
-    """Return the tolerance of a calibrated sensor, whose effects are undone."""
-    std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
-
-    def fitted(effect: str, parameter: str) -> np.ndarray:
-        return _CALIBRATED_STDS * np.array(
-            [std.get(Coefficient(effect, parameter, axis), 0.0) for axis in sensor.axes]
-        )
-
-    zero_g = fitted('bias', 'offset_v') / sensor.nominal_scale_v_per_g + _SHIFT_IN_USE_G
-    if 'temperature_bias' in sensor.effects:
-        # It is undone for room temperature.
-        slopes = [Coefficient('temperature_bias', 'per_k', axis) for axis in sensor.axes]
-        zero_g = zero_g + _TEMPERATURES_K * np.abs(get(sensor, slopes))
-    scale = fitted('scale_factor', 'offset_v_per_g') / sensor.nominal_scale_v_per_g
-    across = np.concatenate([fitted('misalignment', name) for name in ('alpha_rad', 'beta_rad')])
-    return Tolerance(
-        G0_MPS2 * zero_g, scale + _CHANGE_IN_USE, max(float(across.max()), _CHANGE_IN_USE)
-    )
-
-
-IDEAL = Tolerance(np.zeros(3), np.zeros(3), _CHANGE_IN_USE)
-"""The tolerance of another simulator, whose readings are ideal up to its value of gravity."""
-
-
-@dataclass(frozen=True)
 class RestReadings:
     """The means of k rests on m axes."""
 
@@ -181,7 +68,7 @@ class RestReadings:
     @property
     def length_mps2(self) -> np.ndarray:
         """Length of the readings, m/s², (k,)."""
-        return np.asarray(np.linalg.norm(self.mean_mps2, axis=1))
+        return np.linalg.norm(self.mean_mps2, axis=1)
 
     @property
     def poses(self) -> int:
@@ -353,9 +240,7 @@ class _Case:
     def error_mps2(self) -> np.ndarray:
         """Error of a length that neither zero-g nor scale explain, m/s², (k,)."""
         noise_mps2 = np.linalg.norm(self.readings.std_mps2, axis=1)
-        return np.asarray(
-            self.tolerance.across * self.gravity_mps2 + _LOCAL_MPS2 + _NOISE_STDS * noise_mps2
-        )
+        return self.tolerance.across * self.gravity_mps2 + _LOCAL_MPS2 + _NOISE_STDS * noise_mps2
 
     def force_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest length of the force of each rest, m/s², (k,) each."""
@@ -399,21 +284,13 @@ class _Case:
         mean = self.readings.mean_mps2
         axes = self.readings.mean_mps2.shape[1]
         # |r|² = 2·r·b + (|f|² − |b|²) is linear in b and in the bracket.
-        near_0 = np.diag(
-            prior
-            * 2
-            * self.gravity_mps2
-            * self.error_mps2.mean()
-            / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2)
-        )
-        rows = np.vstack(
-            [
-                np.column_stack([2 * mean, np.ones(len(mean))]),
-                np.column_stack([near_0, np.zeros(axes)]),
-            ]
-        )
+        scale_mps2 = prior * 2 * self.gravity_mps2 * self.error_mps2.mean()
+        near_0 = np.diag(scale_mps2 / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2))
+        by_zero_g = np.vstack([2 * mean, near_0])
+        by_bracket = np.append(np.ones(len(mean)), np.zeros(axes))
+        rows = np.column_stack([by_zero_g, by_bracket])
         squares = np.append((mean**2).sum(axis=1), np.zeros(axes))
-        return np.asarray(np.linalg.lstsq(rows, squares)[0][:axes])
+        return np.linalg.lstsq(rows, squares)[0][:axes]
 
     def _unexplained(self, zero_g_mps2: np.ndarray) -> np.ndarray:
         """Return which rests no zero-g near a first guess, m/s², (m,), and scale explain, (k,)."""
@@ -440,7 +317,7 @@ class _Case:
                 weighted @ rows + _PRIOR * np.eye(2 * axes), weighted @ beyond + _PRIOR * shares
             )
             shares = np.clip(shares - step, -1.0, 1.0)
-        return np.asarray(np.abs(beyond) > 1)
+        return np.abs(beyond) > 1
 
     def divided(self, factors: np.ndarray | float) -> _Case:
         """Return the case of readings that are divided by factors."""
@@ -452,7 +329,7 @@ class _Case:
         longer = self.too_long().mean()
         shorter = self.too_short().mean()
         is_off = max(longer, shorter) > 0.5
-        is_spread = wrong.sum() > 1 and wrong.mean() > _LARGEST_FALSE_SHARE
+        contradict = wrong.sum() > 1
         if is_off and (unit_fault := self._unit()):
             return unit_fault
         if is_off and self._is_removed():
@@ -461,7 +338,8 @@ class _Case:
                 f'at rest {self._read()}: gravity is missing, as in linear acceleration',
                 'record the specific force, which includes gravity',
             )
-        if (is_off or wrong.sum() > 1) and (mixed := self._mixed_units()):
+        mixed = self._mixed_units() if is_off or contradict else None
+        if mixed is not None:
             return mixed
         if is_off:
             return GravityFault(
@@ -469,7 +347,7 @@ class _Case:
                 f'at rest {self._read()}{self._range() or self._offset()}',
                 'check unit, zero-g and scale factor',
             )
-        if is_spread:
+        if contradict and wrong.mean() > _LARGEST_FALSE_SHARE:
             return self._spread(wrong)
         return None
 
@@ -516,6 +394,7 @@ class _Case:
         )
 
     def _fits(self, unit: ReadingUnit) -> bool:
+        """Return whether the readings are those of a sound sensor in a unit."""
         case = self.divided(unit.gravity / self.gravity_mps2)
         if not case.is_explained():
             return False
@@ -536,7 +415,8 @@ class _Case:
         """Return the units of single axes in which the rests of several poses are gravity."""
         axes = self.readings.mean_mps2.shape[1]
         is_told = self.tolerance.zero_g_mps2.max() < self.gravity_mps2 / 2
-        if self.readings.poses < 2 or axes < len(AXES) or not is_told:
+        has_length = self.readings.poses > 1 and axes == len(AXES)
+        if not (is_told and has_length):
             return None
         length = max(float(np.median(self.readings.length_mps2)), _LEAST_MPS2)
         if not self.divided(length / self.gravity_mps2).contradicting().any():
@@ -638,6 +518,9 @@ def require_unit(gravity: GravityAtRest, path: str, needs_gravity: bool = False)
     needs_gravity: whether readings without gravity are refused as well.
     """
     fault = gravity.fault
-    if fault is not None and (fault.is_unit or (needs_gravity and fault.is_clear)):
+    if fault is None:
+        return []
+    is_refused = fault.is_clear if needs_gravity else fault.is_unit
+    if is_refused:
         raise UserError(f'{path}: {fault.text}')
-    return [] if fault is None else [fault.text]
+    return [fault.text]

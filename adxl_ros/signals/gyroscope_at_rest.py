@@ -21,7 +21,7 @@ from adxl_ros.model.constants import Z_90
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import DITHERED_STEPS, smallest_change
-from adxl_ros.signals.rest_detection import RecordedRests
+from adxl_ros.signals.rest_detection import rests_of
 import numpy as np
 import scipy
 
@@ -50,10 +50,7 @@ def rest_turns(read: Recording, sensor: Sensor, are_rows: bool = False) -> list[
     if are_rows:
         places = [np.arange(len(read)) == row for row in range(len(read))]
     else:
-        rests = RecordedRests(sensor, read)
-        rests.feed(read)
-        rests.take()
-        places = [found.rest.includes(read.time_s) for found in rests.detected]
+        places = [found.rest.includes(read.time_s) for found in rests_of(sensor, read)]
     turns = [
         RestTurns(gyro_radps[place & is_taken], temperature_c[place & is_taken])
         for place in places

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.process import option
-from adxl_ros.signals.rest_detection import Rest
+from adxl_ros.signals.rest_search import Rest
 import numpy as np
 import scipy
 
@@ -140,27 +140,27 @@ class GyroLook:
         bias = np.median(rates, axis=0) if rates else np.zeros(3)
         left = angles - bias * spans_s[:, None]
         turns = []
-        for (rest, mean), (later, later_mean) in pairwise(zip(rests, means_mps2)):
-            begin_s = rest.time_stop_s
-            end_s = later.time_start_s
-            rows = (time_s >= begin_s) & (time_s < end_s)
-            has_gap = spans_s[rows].max(initial=0.0) > _CELL_S + 2 * self._period_s * self._rows
-            if len(mean) == len(AXES) and end_s - begin_s < _LONGEST_TURN_S and not has_gap:
-                before = mean / np.linalg.norm(mean)
-                after = later_mean / np.linalg.norm(later_mean)
-                turns.append(_Turn(before, after, left[rows]))
-        turns = sorted(turns, key=lambda turn: -turn.size)[:_MOST_TURNS]
-        turns = [turn for turn in turns if turn.size > _SMALLEST_TURN]
-        error, faults = _disagreement(turns)
-        if not faults:
-            faults = self._alone(bias)
+        for (rest, before), (later, after) in pairwise(zip(rests, means_mps2)):
+            rows = (time_s >= rest.time_stop_s) & (time_s < later.time_start_s)
+            is_short = later.time_start_s - rest.time_stop_s < _LONGEST_TURN_S
+            has_direction = len(before) == len(AXES)
+            is_usable = is_short and has_direction
+            if is_usable and not self._has_gap(spans_s[rows]):
+                turns.append(_Turn(_direction(before), _direction(after), left[rows]))
+        largest = sorted(turns, key=lambda turn: -turn.size)[:_MOST_TURNS]
+        turns = [turn for turn in largest if turn.size > _SMALLEST_TURN]
+        error_rad, faults = _disagreement(turns)
         return GyroFindings(
-            tuple(bias.tolist()) if rates else (),
-            self._largest_radps,
-            len(turns),
-            error,
-            tuple(faults),
+            bias_radps=tuple(bias.tolist()) if rates else (),
+            largest_radps=self._largest_radps,
+            turns=len(turns),
+            error_rad=error_rad,
+            faults=tuple(faults or self._alone(bias)),
         )
+
+    def _has_gap(self, spans_s: np.ndarray) -> bool:
+        """Return whether samples are missing in cells of some lengths, s, (k,)."""
+        return bool(spans_s.max(initial=0.0) > _CELL_S + 2 * self._period_s * self._rows)
 
     def _alone(self, bias: np.ndarray) -> list[str]:
         """Return what is wrong with the readings themselves."""
@@ -180,6 +180,11 @@ class GyroLook:
                 f'{_LARGEST_BIAS_RADPS:.2g} rad/s at most; check its zero, and its unit'
             )
         return faults
+
+
+def _direction(mean: np.ndarray) -> np.ndarray:
+    """Return the direction of a force, (3,)."""
+    return mean / np.linalg.norm(mean)
 
 
 def _disagreement(turns: Sequence[_Turn]) -> tuple[float, list[str]]:

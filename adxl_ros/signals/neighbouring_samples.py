@@ -186,9 +186,10 @@ class NeighbouringSamples:
             for n in range(2, _MOST_REPEATS + 1)
             if self._runs[n::n].sum() >= _REGULAR_SHARE * count
         ]
+        is_even = mean >= _FEWEST_EVEN and scatter <= _EVEN_RUNS * mean
         if regular:
             mean = float(regular[-1])
-        elif mean < _FEWEST_EVEN or scatter > _EVEN_RUNS * mean or 2 * self._wide < count:
+        elif not is_even or 2 * self._wide < count:
             return ''
         return (
             f'each reading stands for {mean:.3g} samples: the sensor has '
@@ -258,6 +259,7 @@ class NeighbouringSamples:
                 self._jumps.append(_Jump(float(time_s[i]), float(size[i]), is_held))
 
     def _jumped(self) -> str:
+        """Return where the readings jump from one rest to another."""
         # Rests that were cut out of a recording and joined jump at each of their ends.
         if not 0 < len(self._jumps) <= _MOST_TURNS:
             return ''
@@ -394,7 +396,8 @@ class _Ends:
             half = int(self._sizes[is_half & ~is_full].sum())
             fills = max(abs(low_g + range_g / 2), abs(high_g - range_g / 2)) < _FILLED * range_g
             is_range = high_g - low_g < (1 + _ROUNDING) * range_g
-            if is_range and full >= _FEWEST_WRAPS and (full > half or fills):
+            is_frequent = full >= _FEWEST_WRAPS and (full > half or fills)
+            if is_range and is_frequent:
                 advice = 'record with a larger range'
                 if low_g > -_FILLED * range_g:
                     advice = 'read them as signed numbers'

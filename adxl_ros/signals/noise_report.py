@@ -19,14 +19,22 @@ from adxl_ros.report.figures import AXIS_COLOURS, new_figure
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals.allan_deviation import StillStretch
-from adxl_ros.signals.gravity_at_rest import AXIS_UNITS
 from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise
+from adxl_ros.signals.reading_units import AXIS_UNITS
 import numpy as np
 import yaml
 
 _MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
 _NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
 TERMS = ('white', 'instability', 'walk')  # Their fields in `NoiseFit`
+_SAME_NOISE = float(np.log(1.6))
+"""Logarithm of the ratio of the noise of two axes in one unit. Chosen: datasheets state up to 1.5
+for z, and the ratio of g and m/s² is far above its square."""
+_LEVEL_G = 0.5  # Largest reading of an axis whose unit gravity does not show, g: 30° of tilt
+_YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
+_PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
+_INCHES = (5.0, 4.4)
+"""Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
 
 
 class _ReadingUnits(NamedTuple):
@@ -58,14 +66,6 @@ def sensors_at_rest(result: RecordingNoise) -> list[SensorAtRest]:
     if result.gyro_rest is not None:
         shown.append(SensorAtRest('gyroscope', result.gyro_rest, result.gyro, _GYRO))
     return shown
-
-
-_SAME_NOISE = float(np.log(1.6))
-"""Logarithm of the ratio of the noise of two axes in one unit. Chosen: datasheets state up to 1.5
-for z, and the ratio of g and m/s² is far above its square."""
-_LEVEL_G = 0.5  # Largest reading of an axis whose unit gravity does not show, g: 30° of tilt
-_YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
-_PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
 
 
 def head(result: RecordingNoise) -> list[str]:
@@ -242,7 +242,8 @@ def _unit_warnings(result: RecordingNoise) -> list[str]:
             is_near = abs(np.log(max(ratio, TINY) / factor)) < _SAME_NOISE
             # Gravity along the axis would show its unit.
             if is_near and abs(mean_mps2) < _LEVEL_G * unit.gravity:
-                n, other_n = (_MICRO_G * each.sample_white for each in (noise, upright))
+                n = _MICRO_G * noise.sample_white
+                other_n = _MICRO_G * upright.sample_white
                 texts.append(
                     f'{noise.axis}: N is {n:.3g} µg/√Hz, {ratio:.3g} times that of {upright.axis} '
                     f'({other_n:.3g}), as if it were in {unit.name}; gravity, which is along '
@@ -264,6 +265,7 @@ def filter_warning(stated: Sensor, fresh: Sensor) -> list[str]:
 
 
 def _axis_warnings(span_s: float, noise: AxisNoise, unit: _ReadingUnits) -> list[str]:
+    """Return what an axis does not show, and what to do, one text each."""
     texts = []
     for term, name in enumerate(_NAMES):
         if not (noise.estimates[term].is_seen or noise.is_coarse):
@@ -287,10 +289,6 @@ def _axis_warnings(span_s: float, noise: AxisNoise, unit: _ReadingUnits) -> list
             'states no white noise.'
         )
     return texts
-
-
-_INCHES = (5.0, 4.4)
-"""Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
 
 
 def curves(result: RecordingNoise) -> Any:

@@ -6,16 +6,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files.recording_columns import Recording, uncalibrated
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import uncalibrated
 from adxl_ros.model.constants import TINY
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.signals.axis_ranges import axis_faults, AxisLook, AxisRange
 from adxl_ros.signals.gravity_at_rest import GravityAtRest, GravityFaultKind, of_volts, TURNED_COS
 from adxl_ros.signals.neighbouring_samples import NeighbouringSamples
-from adxl_ros.signals.rest_detection import datasheet_noise, RecordedRests, RestFinder, RestMean
+from adxl_ros.signals.rest_detection import RecordedRests, RestFinder, RestMean
+from adxl_ros.signals.rest_limits import datasheet_noise
+from adxl_ros.signals.rest_search import BY_STREAM, RestRule
 import numpy as np
+
+LIVE_WINDOW_S = 4.0  # Newest samples in which a live stream may rest, s. Chosen: two short rests
+_OTHER_STREAM = 1.5  # Ratio of two lengths in one pose from which the driver has changed its unit
+_MOST_POSES = 20  # Newest poses of a live stream that are kept. Chosen: a tumble by hand
 
 
 class RecordingLook:
@@ -79,11 +87,6 @@ class RecordingLook:
             raise UserError('; '.join([one_line(error), *faults])) from None
 
 
-LIVE_WINDOW_S = 4.0  # Newest samples in which a live stream may rest, s. Chosen: two short rests
-_OTHER_STREAM = 1.5  # Ratio of two lengths in one pose from which the driver has changed its unit
-_MOST_POSES = 20  # Newest poses of a live stream that are kept. Chosen: a tumble by hand
-
-
 class LiveLook:
     """
     Looks at gravity over the newest rests of a live stream.
@@ -112,30 +115,28 @@ class LiveLook:
             self._rests = {True: [], False: []}
         time_s = (stamps_ns - stamps_ns[:1].sum()) * 1e-9
         volts = to_volts(accel_mps2[:, : len(sensor.axes)], sensor)
-        by_stream = self._look(
-            sensor,
-            RestFinder(rate_hz, len(sensor.axes)),
-            time_s,
-            volts,
-        )
+        look = partial(self._look, sensor, rate_hz, time_s, volts)
+        by_stream = look(BY_STREAM)
         if by_stream.fault is not None and by_stream.fault.is_clear:
             return by_stream
-        return self._look(
-            sensor,
-            RestFinder(rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=False),
-            time_s,
-            volts,
-        )
+        return look(RestRule(datasheet_noise(sensor), learns=False))
 
     def _look(
-        self, sensor: Sensor, finder: RestFinder, time_s: np.ndarray, volts: np.ndarray
+        self,
+        sensor: Sensor,
+        rate_hz: float,
+        time_s: np.ndarray,
+        volts: np.ndarray,
+        rule: RestRule,
     ) -> GravityAtRest:
         """Add the rests of a window to those before, and look at all of them."""
+        finder = RestFinder(rate_hz, volts.shape[1], rule)
         finder.feed(time_s, volts)
-        rests = finder.rests()
-        for found in map(RestMean, rests, *finder.means(rests)):
-            self._rests[finder.learn] = _with_rest(self._rests[finder.learn], found, sensor)
-        return _of_rests(self._rests[finder.learn], sensor)
+        rests = self._rests[rule.learns]
+        for found in finder.means(finder.rests()):
+            rests = _with_rest(rests, found, sensor)
+        self._rests[rule.learns] = rests
+        return _of_rests(rests, sensor)
 
 
 def _of_rests(rests: list[RestMean], sensor: Sensor) -> GravityAtRest:

@@ -77,7 +77,7 @@ class _Grid:
 
     def at(self, steps: np.ndarray) -> np.ndarray:
         """Return the volts at steps, (n,) int: (n, m)."""
-        return self._rows[steps - self.begin]
+        return np.take(self._rows.T, steps - self.begin, axis=1).T
 
     def between(self, steps: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Interpolate from steps and their weights, (n, points): (n, m)."""
@@ -120,12 +120,17 @@ class Response:
         memo: ChainMemo | None = None,
         block_steps: int = _BLOCK_STEPS,
     ) -> None:
-        """Put the sensor, settled, at the beginning of a manoeuvre; keep results in a memo."""
+        """
+        Put the sensor, settled, at the beginning of a manoeuvre.
+
+        With a memo, which keeps results, all samples come at once.
+        """
         check_needs(sensor, motion)
         self.sensor = sensor
         self._motion = motion
         self._begin_s = begin_s
         self._seed = seed
+        self._is_whole = memo is not None
         self._memo = memo or ChainMemo(0)
         self._block_steps = block_steps
         self._chain = Chain(sensor, seed=seed)
@@ -226,6 +231,10 @@ class Response:
         nearest = np.rint(steps)
         aligned = bool(np.abs(steps - nearest).max() < _ALIGNED_STEPS)
         until = int(nearest[-1]) + 1 + (0 if aligned else POINTS // 2)
+        every = round(1 / (self.sensor.rate_hz * self._step_s))
+        if self._is_whole and aligned and not np.any(nearest % every):
+            signals = self._advance(until, every)
+            return self._grid.at((nearest / every).astype(np.intp)), signals
         signals = self._advance(until)
         while self._grid.end < until:  # a gap, without samples
             signals = self._advance(until)
@@ -237,16 +246,20 @@ class Response:
         self._grid.forget()
         return volts, signals
 
-    def _advance(self, until: int) -> Signals:
-        """Run the chain up to the filter over the next steps of the grid, a block at most."""
+    def _advance(self, until: int, every: int = 1) -> Signals:
+        """
+        Run the chain up to the filter over the next steps of the grid, a block at most.
+
+        every: the grid keeps each k-th step alone.
+        """
         count = max(min(until - self._grid.end, self._block_steps), 0)
         signals = self._output_of_element(count)
-        volts = np.empty((count, len(self.sensor.axes)))
-        for d, v in enumerate(self._chain.volts(signals, Place.ELECTRONICS)):
-            volts[:, d] = low_pass(
-                np.broadcast_to(v, count), signals.rc_s[d], self._dt_s, self._filters[d]
-            )
-        self._grid.extend(volts, 2 * self._block_steps)
+        unfiltered = self._chain.volts(signals, Place.ELECTRONICS)
+        volts = [
+            low_pass(np.broadcast_to(v, count), tau_s, self._dt_s, memory, every=every)
+            for v, tau_s, memory in zip(unfiltered, signals.rc_s, self._filters)
+        ]
+        self._grid.extend(np.array(volts).T, 2 * self._block_steps)
         return signals
 
     @property
@@ -339,7 +352,7 @@ class Response:
         rate_hz = self.sensor.rate_hz
         std_v = noise.analog_std_v(self.sensor)
         if not std_v.any():
-            return np.zeros((len(stamps_s), len(std_v)))
+            return np.zeros((len(std_v), len(stamps_s))).T
         decay = np.array([np.exp(-1 / (rate_hz * rc)) if rc else 0.0 for rc in rc_s])
         passed = np.rint(np.diff(stamps_s, prepend=self._last_s) * rate_hz).astype(np.intp)
         passed = np.clip(passed, 1, 1 + ceil(_NOISE_MEMORY * rc_s.max() * rate_hz))
@@ -411,7 +424,7 @@ def whole_response(
         if steps <= _WHOLE_STEPS
         else Response(sensor, motion, seed, begin_s)
     )
-    return memo('volts', respond.key(stamps_s), partial(respond, stamps_s)).copy()
+    return memo('volts', respond.key(stamps_s), partial(respond, stamps_s)).copy('K')
 
 
 def simulate(

@@ -20,7 +20,7 @@ from adxl_ros.files import robot_readings
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.robot_readings import JointTrack, RobotReadings
-from adxl_ros.files.stamps import period_s, stamped_rate_hz
+from adxl_ros.files.stamps import mean_period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
 from adxl_ros.process import option
@@ -220,7 +220,7 @@ class RobotPath(ForcePath):
         paths: list[Path] = []
         for (time_s, values), step in zip(tracks, self._steps):
             if np.ptp(values):
-                knot_s = min(KNOT_S, _KNOT_READINGS * period_s(time_s))
+                knot_s = min(KNOT_S, _KNOT_READINGS * mean_period_s(time_s))
                 paths.append(SmoothedPath(time_s, values, step, is_seen=True, knot_s=knot_s))
             else:
                 paths.append(Held(float(values[0])))

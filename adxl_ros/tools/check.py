@@ -99,6 +99,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _minima(texts: Sequence[str]) -> dict[str, float]:
+    """Return minima by name of texts NAME=VALUE."""
     minima = {}
     for text in texts:
         name, _, value = text.partition('=')
@@ -114,9 +115,10 @@ def _minima(texts: Sequence[str]) -> dict[str, float]:
 
 
 def _next_command(results: Sequence[Findings], options: argparse.Namespace) -> str:
-    for result in results:
+    """Return the command of the first tool that can use a sound recording; '' for none."""
+    for result in filter(lambda result: result.is_sound, results):
         for ability in result.abilities:
-            if result.is_sound and ability.is_able and ability.tool != 'diagnose':
+            if ability.is_able and ability.tool != 'diagnose':
                 reading = cli.reading_text(options)
                 return command(ability.tool, f'{cli.quoted(result.path)}{reading} -o unit.yaml')
     return ''

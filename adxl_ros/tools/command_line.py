@@ -29,6 +29,13 @@ if TYPE_CHECKING:
 
 _BAR_COLUMNS = 24
 """Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
+RECORDING_HELP = 'rosbag2 directory, .mcap, CSV or another table'
+"""Help text of the argument that names a recording."""
+SYNTAX = (
+    'NAME alone has typical values, KEY=VALUE sets a parameter for all its axes, '
+    'KEY.AXIS=VALUE for one; parameters without a value are neutral'
+)
+"""What an option may be, for help texts."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -59,10 +66,6 @@ def effect_list(effects: Iterable[Effect]) -> str:
     """Return a list of effects with their causes for a help text, by name."""
     causes = {effect.name: effect.cause.partition(';')[0].rstrip('.') for effect in effects}
     return entry_list('effects', dict(sorted(causes.items())))
-
-
-RECORDING_HELP = 'rosbag2 directory, .mcap, CSV or another table'
-"""Help text of the argument that names a recording."""
 
 
 def add_recording_options(parse: argparse.ArgumentParser) -> None:
@@ -164,13 +167,6 @@ def reading_text(options: argparse.Namespace) -> str:
         if value:
             text += f' {option(**{name: value if value is True else shlex.quote(str(value))})}'
     return text
-
-
-SYNTAX = (
-    'NAME alone has typical values, KEY=VALUE sets a parameter for all its axes, '
-    'KEY.AXIS=VALUE for one; parameters without a value are neutral'
-)
-"""What an option may be, for help texts."""
 
 
 def effect_inputs(texts: Iterable[str]) -> list[EffectInput]:

@@ -27,25 +27,22 @@ _EXAMPLES = {
 }
 """Examples of arguments, by their purpose."""
 
-FORMATS = dict(sorted(exports.FORMATS.items()))  # All formats by name
-
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
+    formats = exports.formats()
+    meanings = {name: form.meaning for name, form in formats.items()}
     parse = cli.argument_parser(
-        'export',
-        __doc__,
-        _EXAMPLES,
-        lambda: entry_list('formats', {name: each.meaning for name, each in FORMATS.items()}),
+        'export', __doc__, _EXAMPLES, lambda: entry_list('formats', meanings)
     )
     parse.add_argument('params', metavar='PARAMS', help='parameter file of the sensor')
     parse.add_argument(
         '--to',
         dest='format',
         required=True,
-        choices=list(FORMATS),
+        choices=list(formats),
         metavar='FORMAT',
-        help=f'{", ".join(FORMATS)}',
+        help=', '.join(formats),
     )
     parse.add_argument('-o', dest='output', required=True, metavar='FILE', help='the new file')
     cli.add_overwrite_option(parse)
@@ -57,9 +54,9 @@ def export(options: argparse.Namespace) -> int:
     cli.refuse_same_file(options.output, options.params)
     cli.check_outputs(options, options.output)
     sensor = parameter_file.load(options.params)
-    exporter = FORMATS[options.format]
+    holds = exports.places(exports.formats()[options.format], sensor)
     with cli.progress('sizes of the effects') as show:
-        exported = _sized(sensor, options, exports.places(exporter, sensor), show)
+        exported = _sized(sensor, options, holds, show)
     write_text(options.output, exports.text(options.format, exported))
     held = [name for name in exported.sizes_mg if name in exported.holds]
     lost = [name for name in exported.sizes_mg if name not in exported.holds]
@@ -95,12 +92,13 @@ def _sized(
         sizes_mg[exports.STEPS] = _rms_mg([axis.step_mps2 / np.sqrt(12) for axis in axes])
     if sensor.rc_s:
         sizes_mg[exports.FILTER] = change([], False)
+    lost = [name for name in own if name not in holds]
     return exports.Export(
-        sensor,
-        Path(options.params).name,
-        holds,
-        sizes_mg,
-        change([name for name in own if name not in holds], exports.FILTER in holds),
+        sensor=sensor,
+        source=Path(options.params).name,
+        holds=holds,
+        sizes_mg=sizes_mg,
+        remaining_mg=change(lost, exports.FILTER in holds),
     )
 
 

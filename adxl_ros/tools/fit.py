@@ -34,6 +34,7 @@ _EXAMPLES = {
     'a further effect': 'sweep.csv --effect temperature_bias -o unit.yaml',
 }
 """Examples of arguments, by their purpose."""
+_MEANS_RATE_HZ = 1.0  # Stamps of a table of means, which have no meaning
 
 
 def parser() -> argparse.ArgumentParser:
@@ -123,9 +124,6 @@ def _details() -> str:
     return cli.effect_list(
         effect for effect in library().values() if effect.invertible or effect.place is Place.STAGE
     )
-
-
-_MEANS_RATE_HZ = 1.0  # Stamps of a table of means, which have no meaning
 
 
 def _update(options: argparse.Namespace) -> int:

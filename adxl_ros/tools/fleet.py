@@ -15,7 +15,7 @@ from time import monotonic
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import make_folder
-from adxl_ros.files.recording_columns import NO_SERIAL
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.fleet.inputs import find_sources, FoundRecording, stated_by
 from adxl_ros.fleet.row import (
     as_date,

@@ -89,7 +89,7 @@ def test_a_gap_writes_what_it_returns(gap, tmp_path) -> None:
     (tmp_path / 'gap' / 'report.html').write_text('precious')
     with pytest.raises(adxl.UserError, match='overwrite=True'):
         gap.save(tmp_path / 'gap')
-    assert gap.command('again').endswith('diagnose RECORDING --params adxl203 -o again')
+    assert gap.compared.command('again').endswith('diagnose RECORDING --params adxl203 -o again')
     commands = [step.command for step in gap.next_steps('gap')]
     assert not any(' arrays' in command for command in commands), commands
 

@@ -128,7 +128,7 @@ def test_arrays_in_g_are_read_as_the_message_says(name: str) -> None:
     }
     with pytest.raises(adxl.UserError) as error:
         adxl.noise(adxl.from_arrays(**arrays))
-    options = dict(re.findall(r"read\(\.\.\., (\w+)='(.*?)'\)", str(error.value)))
+    options = dict(re.findall(r"from_arrays\(\.\.\., (\w+)='(.*?)'\)", str(error.value)))
     assert len(options) == 1
     for recording in (adxl.from_arrays(**arrays, **options), adxl.read(arrays, **options)):
         for column, values in LEVEL.items():
@@ -143,21 +143,25 @@ def test_every_verb_is_asked() -> None:
 @pytest.mark.parametrize(
     'make, of_tool, of_verb',
     [
-        (partial(option, 'drop_bad_stamps'), '--drop-bad-stamps', 'read(..., drop_bad_stamps=)'),
+        (
+            partial(option, 'drop_bad_stamps'),
+            '--drop-bad-stamps',
+            'read or from_arrays(..., drop_bad_stamps=)',
+        ),
         (partial(option, align=True), '--align', 'align=True'),
         (partial(option, sensor='a.yaml'), '--params a.yaml', "sensor='a.yaml'"),
-        (partial(option, rate='HZ'), '--rate HZ', 'read(..., rate=HZ)'),
+        (partial(option, rate='HZ'), '--rate HZ', 'read or from_arrays(..., rate=HZ)'),
         (
             partial(option, unit='lsb', lsb_per_g=64),
             '--unit lsb --lsb-per-g 64',
-            "read(..., unit='lsb', lsb_per_g=64)",
+            "read or from_arrays(..., unit='lsb', lsb_per_g=64)",
         ),
         (partial(option, quantity='tilt'), '--in tilt', "quantity='tilt'"),
         (partial(option, 'certificate'), '--dcc', 'certificate()'),
         (
             partial(pasted, columns='x=a b:g'),
             "--columns 'x=a b:g'",
-            "read(..., columns='x=a b:g')",
+            "read or from_arrays(..., columns='x=a b:g')",
         ),
         (partial(usage, 'fit', effects=['bias']), 'fit --effect bias', "fit(effects=['bias'])"),
         (

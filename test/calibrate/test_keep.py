@@ -116,10 +116,15 @@ def test_a_restart_after_any_line_goes_on_and_undo_goes_back(tmp_path):
     for rest in days:
         keeper.add(rest)
     journal.close()
-    assert keeper.adoptions
     path = tmp_path / 'j'
+    journal = Journal(path, HEAD)
+    journal.close()
+    entries = journal.entries
+    adopted = max(n for n, entry in enumerate(entries) if isinstance(entry, Adopted))
     lines = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b''.join(lines[:-40]) + lines[-40][:20])
+    # Some rests before the adoption, which comes when it would have come
+    cut = len(lines) - len(entries) + adopted - 5
+    path.write_bytes(b''.join(lines[:cut]) + lines[cut][:20])
     journal = Journal(path, HEAD)
     again = Keeper(calibrated(), entries=journal.entries, write=journal.append)
     taken = sum(not isinstance(entry, Adopted) for entry in journal.entries)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, StreamInterval
 from adxl_ros.files import calibration_store
-from adxl_ros.files.recording_columns import sensor_info, StreamInfo
+from adxl_ros.files.stream_info import sensor_info, StreamInfo
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.level import Level

@@ -8,9 +8,10 @@ from adxl_ros.diagnose.axis_checks import check_axes, check_output, stuck
 from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.encoder_checks import check_encoder
-from adxl_ros.diagnose.motion_shifts import correlations, find_drift, find_step, Motions
+from adxl_ros.diagnose.motion_shifts import correlate, find_drift, find_step, Motions
 from adxl_ros.diagnose.stamp_checks import check_clock, even_stamps
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate.motion import ForcePath, Motion
 import numpy as np
@@ -66,9 +67,9 @@ def test_impossible_stamps_are_refused(time_s, name, words):
 def test_the_correlation_of_two_motions_is_one_at_their_lag(lag):
     motion_g = wandering(600)
     first = motion_g[100:400]
-    found = correlations(first, motion_g[100 - lag :], 200)
+    found = correlate(first, motion_g[100 - lag :], 0.5, 200)
     best = np.argmax(found.correlation)
-    assert (found.lags[best], found.overlap[best]) == (lag, 300 + min(lag, 0))
+    assert found.late_s == 0.5 * lag and found.overlap[best] == 300 + min(lag, 0)
     assert found.correlation[best] == pytest.approx(1.0, abs=1e-9)
 
 

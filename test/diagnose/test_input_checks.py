@@ -8,7 +8,8 @@ import json
 from adxl_ros.diagnose.data_checks import check_recording, compare_checked
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate import trajectories

@@ -8,7 +8,8 @@ import subprocess
 import sys
 
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.trajectories import rich
 import numpy as np

@@ -7,7 +7,8 @@ from dataclasses import replace
 import json
 
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.response import Response
 import numpy as np

@@ -7,7 +7,8 @@ import json
 import re
 
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.report.quantities import parameter_text
 from adxl_ros.simulate import trajectories

@@ -5,6 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.diagnose.comparison import compare
+from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.linear_model import build_linear_model
 from adxl_ros.diagnose.search import fit_hypothesis, linearise, Search
 from adxl_ros.model.effects.base import Coefficient
@@ -19,11 +20,11 @@ PER_K = 4e-4
 ARM_M = 0.03
 
 
-def model_of(*effects):
+def model_of(*effects, only=LIBRARY):
     sensor = unit()
     motion = warm(turning(alphas=(np.pi / 2, np.pi / 4)))
     recording = simulated(sensor, *effects, motion=motion)
-    return build_linear_model([compare(recording, sensor)], only=LIBRARY)
+    return build_linear_model([compare(recording, sensor)], only=only)
 
 
 @pytest.fixture(scope='module')
@@ -78,6 +79,26 @@ def test_a_true_effect_gains_evidence_and_another_one_none(warmed):
     false = fit_hypothesis(warmed, ['lever_arm'], {}, {})
     assert true.log_evidence > nothing.log_evidence + 10
     assert false.log_evidence < nothing.log_evidence + 3
+
+
+def test_an_error_of_form_feeds_itself_and_no_further_effect():
+    """A quadratic law with some cubic part has its own form; a lever arm is another cause."""
+    laws = 'quadratic:quadratic_per_g=0.02', 'nonlinearity:cubic_per_g2=0.001'
+    model = model_of(*laws, f'lever_arm:z_m={ARM_M}', only=(*LIBRARY, 'nonlinearity'))
+
+    def left(*effects):
+        fits = HeldOutFits(fit_hypothesis(model, effects, {}, {}).linearised, model)
+        beside = fits.beside_form_errors(frozenset({'quadratic'}))
+        return fits.figures.squares.sum(), beside.squares.sum()
+
+    plain, beside = np.subtract(
+        left('quadratic', 'lever_arm'), left('quadratic', 'lever_arm', 'nonlinearity')
+    )
+    assert beside < 0.1 * plain
+    plain, beside = np.subtract(
+        left('quadratic', 'nonlinearity'), left('quadratic', 'nonlinearity', 'lever_arm')
+    )
+    assert beside > 0.9 * plain
 
 
 def test_a_decay_that_takes_for_ever_is_a_zero_g():

@@ -83,6 +83,23 @@ def test_a_second_effect_must_explain_more_than_what_is_material():
     assert decided(both).effects == ('bias', 'lever_arm')
 
 
+@pytest.mark.parametrize(('form_error', 'named'), [(0.0, ('bias', 'lever_arm')), (0.3, ('bias',))])
+def test_a_weak_second_effect_must_exceed_an_error_of_form_of_the_first(form_error, named):
+    """It holds a sixteenth of what the pair explains; an error of form may explain as much."""
+    candidates = {
+        NOTHING: fits(5.0),
+        BIAS: fits(0.3),
+        LEVER_ARM: fits(4.5),
+        BIAS | LEVER_ARM: fits(0.0),
+    }
+    for effects, made in candidates.items():
+        left = 0.3 - form_error if effects == BIAS else 0.0
+        beside = dict.fromkeys(candidates, fits(left)[HEALTHY].figures)
+        made[HEALTHY].beside_errors = beside
+        made[HEALTHY].beside_form_errors = beside.get
+    assert decided(candidates).effects == named
+
+
 def test_what_repeats_beside_an_effect_is_said():
     verdict = decided({NOTHING: fits(5.0), BIAS: fits(1.0)}, left_over=1.0)
     assert (verdict.status, verdict.effects) == ('partly', ('bias',))

@@ -8,7 +8,8 @@ import sys
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import ACCEL, Recording, REFERENCES, sensor_info
+from adxl_ros.files.recording_columns import ACCEL, Recording, REFERENCES
+from adxl_ros.files.stream_info import sensor_info
 import numpy as np
 import pytest
 from reading import growth_mb, refusal

@@ -8,7 +8,8 @@ import sys
 from adxl_ros.errors import UserError
 from adxl_ros.files import csv_file, recording
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import ACCEL, check_same_sensor, Recording, sensor_info
+from adxl_ros.files.recording_columns import ACCEL, Recording
+from adxl_ros.files.stream_info import check_same_sensor, sensor_info
 import numpy as np
 from pace import within
 import pytest

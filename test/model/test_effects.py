@@ -10,7 +10,7 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.adc import flicker_filter
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, Place
-from adxl_ros.model.filters import play, resonator
+from adxl_ros.model.filters import low_pass, play, resonator
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, typical, with_neutral
 from adxl_ros.simulate.motion import ForcePath, Held, Knots, Motion
 from adxl_ros.simulate.response import Response, simulate
@@ -160,6 +160,11 @@ def test_resonance():
     wave = 2j * (out * np.exp(-2j * np.pi * 80 * time_s))[10000:].mean()
     assert abs(wave) == pytest.approx(10.0, rel=1e-4)
     assert np.degrees(np.angle(wave)) == pytest.approx(-90.0, abs=0.01)
+
+
+def test_some_outputs_of_a_low_pass_are_those_of_all():
+    x = np.cumsum(np.random.default_rng(0).standard_normal(1000))
+    assert low_pass(x, 3e-3, 4e-3, {}, every=3) == pytest.approx(low_pass(x, 3e-3, 4e-3, {})[::3])
 
 
 def test_area_of_the_loop_of_play():

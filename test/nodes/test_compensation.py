@@ -8,7 +8,7 @@ from pathlib import Path
 import signal
 
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import sensor_info
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import force_covariance

@@ -4,7 +4,7 @@
 
 import time
 
-from adxl_ros.files.recording_columns import sensor_info
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import to_nominal_mps2, to_volts
 from adxl_ros.nodes.driver import other_sensor

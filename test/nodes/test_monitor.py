@@ -11,7 +11,7 @@ import re
 import time
 
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import sensor_info
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response

@@ -15,14 +15,13 @@ from adxl_ros.signals.findings import check_recording
 from adxl_ros.signals.gravity_at_rest import (
     GravityAtRest,
     GravityFaultKind,
-    IDEAL,
     look,
-    nominal_tolerance,
     of_volts,
     require_unit,
     RestReadings,
 )
 from adxl_ros.signals.recorded_gravity import LiveLook, RecordingLook
+from adxl_ros.signals.tolerances import IDEAL, nominal_tolerance
 import numpy as np
 import pytest
 

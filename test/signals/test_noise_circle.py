@@ -9,7 +9,8 @@ import re
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import exports, parameter_file
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, with_axes
@@ -133,7 +134,7 @@ FIGURES: dict[str, tuple[str, Figure]] = {
 
 
 def test_all_formats_have_a_figure() -> None:
-    assert set(FIGURES) == set(exports.FORMATS)
+    assert set(FIGURES) == set(exports.formats())
 
 
 @pytest.mark.parametrize('rate_hz', RATES_HZ)

@@ -2,7 +2,7 @@
 
 """White noise, bias instability and random walk of simulated signals, and their intervals."""
 
-from adxl_ros.signals.noise_parameters import coefficient_variances, fit_noise
+from adxl_ros.signals.noise_fit import coefficient_variances, fit_noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter

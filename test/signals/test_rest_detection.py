@@ -7,7 +7,10 @@ from adxl_ros.files import recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
-from adxl_ros.signals.rest_detection import find_rests, Rest, rest_means, RestFinder, SampleNoise
+from adxl_ros.signals.rest_detection import find_rests, RestFinder
+from adxl_ros.signals.rest_limits import SampleNoise
+from adxl_ros.signals.rest_means import rest_means
+from adxl_ros.signals.rest_search import Rest, RestRule
 from hypothesis import given, settings, strategies
 from needs import lack
 import numpy as np
@@ -105,8 +108,9 @@ def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
     noise = SampleNoise(np.full(axes, SIGMA), 0.01) if known_noise else None
     tolerance = 1e-3 if with_stage else None
     angles = np.round(samples[:, [0, 0]] / 3) if with_stage else None
-    offline = find_rests(time_s, samples, rate_hz, angles, noise, angle_tolerance_rad=tolerance)
-    live = RestFinder(rate_hz, axes, noise, angle_tolerance_rad=tolerance)
+    rule = RestRule(noise, learns=noise is None, angle_tolerance_rad=tolerance)
+    offline = find_rests(time_s, samples, rate_hz, rule, angles)
+    live = RestFinder(rate_hz, axes, rule)
     cuts = np.sort(rng.integers(0, len(samples), rng.integers(1, 300)))
     for part in np.split(np.arange(len(samples)), cuts):
         live.feed(time_s[part], samples[part], None if angles is None else angles[part])
@@ -115,10 +119,10 @@ def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
             live.stillness()
     assert live.rests() == offline
     if offline:
-        for got, wanted in zip(
-            live.means(offline), rest_means(time_s, samples, offline, rate_hz, noise)
-        ):
-            assert (got == wanted).all()
+        means = zip(*rest_means(time_s, samples, offline, rate_hz, noise))
+        for found, (mean, std) in zip(live.means(offline), means):
+            assert (found.mean_v == mean).all()
+            assert (found.std_v == std).all()
 
 
 @pytest.mark.parametrize('fault', ['stuck', 'clipped'])
@@ -169,7 +173,7 @@ def test_a_shaker_that_never_stops_is_no_rest(swing_g, count):
     turn = 2 * np.pi * 5.02 * time_s
     circle = G0_MPS2 * swing_g * np.array([np.cos(turn), np.sin(turn), 0 * turn]).T
     samples = circle + [0.0, 0.0, G0_MPS2] + SIGMA * rng.normal(size=(6000, 3))
-    assert len(find_rests(time_s, samples, 100.0, gravity=G0_MPS2)) == count
+    assert len(find_rests(time_s, samples, 100.0, RestRule(gravity=G0_MPS2))) == count
 
 
 def test_known_noise_behind_its_filter():
@@ -182,8 +186,8 @@ def test_known_noise_behind_its_filter():
     volts += filtered_noise(rng, len(volts), 0.535e-3)
     volts = np.round(volts / (5 / 2**16)) * 5 / 2**16
     time_s = np.arange(len(volts)) / 1000
-    for learn in (False, True):
-        rests = find_rests(time_s, volts, 1000.0, noise=ADXL, learn=learn)
+    for learns in (False, True):
+        rests = find_rests(time_s, volts, 1000.0, RestRule(ADXL, learns))
         assert len(rests) == 60
         lengths = np.array([rest.time_stop_s - rest.time_start_s for rest in rests])
         assert np.median(lengths) > 4.6
@@ -204,7 +208,7 @@ def test_settling_is_excluded_from_a_rest(tau_s, amplitude):
         time_s = np.arange(10000) / 1000
         tail = amplitude * np.exp(-time_s / tau_s)
         volts[:, 0] += tail
-        rest = find_rests(time_s, volts, 1000.0, noise=ADXL)[0]
+        rest = find_rests(time_s, volts, 1000.0, RestRule(ADXL, learns=False))[0]
         assert rest.stop >= 9000
         worst.append(tail[rest.start : rest.stop].mean())
     assert np.median(worst) < 2.5 * 0.535e-3 / np.sqrt(237)
@@ -224,7 +228,8 @@ def test_the_encoder_ends_a_rest_where_the_sensor_does_not_respond():
     time_s, volts = stage_stream(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
     encoder = np.round(angles / 1.45e-3) * 1.45e-3
     encoder[np.arange(24000) % 20 != 3] = np.nan  # read at 50 Hz
-    rests = find_rests(time_s, volts, 1000.0, encoder, ADXL, angle_tolerance_rad=1.45e-3)
+    rule = RestRule(ADXL, learns=False, angle_tolerance_rad=1.45e-3)
+    rests = find_rests(time_s, volts, 1000.0, rule, encoder)
     assert len(rests) == 4
     for k, rest in enumerate(rests):
         assert np.ptp(angles[rest.start : rest.stop, 1]) < 2 * 1.45e-3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 G, RATE_HZ = 9.80665, 200.0
-SENSOR = parameter_file.load(parameter_file.any_imu_path(), may_measure=True)
+SENSOR = parameter_file.usual(is_nominal=False)
 
 
 def resting(time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

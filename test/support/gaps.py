@@ -4,7 +4,8 @@
 
 from dataclasses import replace
 
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Knots, Motion

@@ -12,7 +12,8 @@ import sys
 
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient

@@ -14,11 +14,11 @@ from typing import Annotated, ClassVar
 from xml.etree import ElementTree
 
 from adxl_ros.files import parameter_file
+from adxl_ros.files.exports import formats
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.simulate.sensor_model import SensorModel
-from adxl_ros.tools.export import FORMATS
 import numpy as np
 from processes import run_in_process
 from pydantic import ConfigDict, create_model, Field
@@ -63,7 +63,7 @@ def exported(tmp_path_factory):
     """Export the unit in all formats, and return the texts of the files and of the screens."""
     folder = tmp_path_factory.mktemp('export')
     parameter_file.save(folder / 'unit.yaml', unit())
-    return {name: export(folder, name) for name in FORMATS}
+    return {name: export(folder, name) for name in formats()}
 
 
 def export(folder, name, sensor=None):
@@ -79,7 +79,7 @@ def mps2(volts):
     return volts / unit().nominal_scale_v_per_g * G0_MPS2
 
 
-@pytest.mark.parametrize('name', sorted({*FORMATS} - {'json', 'genesis'}))
+@pytest.mark.parametrize('name', sorted({*formats()} - {'json', 'genesis'}))
 def test_the_head_says_what_the_format_cannot_hold(exported, name):
     """The size is that of the effect: an angle in mg, times the in-plane force across it."""
     lines = exported[name].text.splitlines()

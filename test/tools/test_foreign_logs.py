@@ -222,7 +222,7 @@ def test_each_row_may_be_the_mean_of_a_rest(run_tool, tmp_path, angles) -> None:
     if angles:
         assert done.returncode == 1 and 'sensor.noise_density_g_per_rthz' in done.stderr
         text = (
-            parameter_file.any_imu_path()
+            parameter_file.usual_path(is_nominal=False)
             .read_text()
             .replace(
                 'rate_hz:', 'noise_density_g_per_rthz: [4.0e-4, 4.0e-4, 4.0e-4]\n      rate_hz:'

@@ -13,7 +13,7 @@ from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stamps import period_s
+from adxl_ros.files.stamps import mean_period_s
 from adxl_ros.model.constants import G0_MPS2, NOMINAL_TEMPERATURE_C, TINY
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import loop, play, stop
@@ -418,7 +418,7 @@ def rest_blocks(recording: Recording, sensor: Sensor) -> Poses | None:
     volts = recording.volts(sensor)
     time_s = recording.time_s
     span_s = recording.span_s
-    block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * period_s(time_s))
+    block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * mean_period_s(time_s))
     starts_s = time_s[0] + block_s * np.arange(int(span_s / block_s) + 1)
     parts = []
     for begin, end in pairwise(np.unique(np.searchsorted(time_s, starts_s))):

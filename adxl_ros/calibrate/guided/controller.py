@@ -14,7 +14,7 @@ from adxl_ros.calibrate.guided.screen_contents import GuideStatus, Phase
 from adxl_ros.calibrate.guided.session import GravityError, Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import nominal_of, StreamInfo
+from adxl_ros.files.stream_info import nominal_of, StreamInfo
 from adxl_ros.files.sweep_journal import differences
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.level import Level

@@ -16,8 +16,10 @@ from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.report.quantities import duration
-from adxl_ros.signals import rest_detection
-from adxl_ros.signals.rest_detection import datasheet_noise, Rest, Stillness
+from adxl_ros.signals.rest_detection import RestFinder, Stillness
+from adxl_ros.signals.rest_limits import datasheet_noise
+from adxl_ros.signals.rest_means import rest_means
+from adxl_ros.signals.rest_search import Rest, RestRule
 import numpy as np
 
 _REST_WINDOW_S = 1.2
@@ -168,9 +170,8 @@ class Dwell:
     def __init__(self, sensor: Sensor, arrived_ns: int) -> None:
         self.arrived_ns = arrived_ns
         self._sensor = sensor
-        self._finder = rest_detection.RestFinder(
-            sensor.rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=False
-        )
+        rule = RestRule(datasheet_noise(sensor), learns=False)
+        self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), rule)
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
 
@@ -218,7 +219,7 @@ class Dwell:
         start = rest.start
         stop = rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
-        mean, std = rest_detection.rest_means(
+        mean, std = rest_means(
             times,
             np.concatenate(self._volts),
             [Rest(start, stop, times[start], times[stop - 1])],

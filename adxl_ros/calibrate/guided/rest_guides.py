@@ -26,7 +26,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
 from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.sensor import parameter_of, Sensor
-from adxl_ros.signals.rest_detection import datasheet_noise, RestFinder, Stillness
+from adxl_ros.signals.rest_detection import RestFinder, Stillness
+from adxl_ros.signals.rest_limits import datasheet_noise
+from adxl_ros.signals.rest_search import RestRule
 import numpy as np
 
 ENOUGH_RESTS = 24  # Rests that are recommended; chosen: nearly all of the 26 orientations
@@ -106,9 +108,8 @@ class HandRests(Guide):
         self._stamps: list[np.ndarray] = []
         self._announced_ns = self._next_search_ns = 0
         self._dropped: list[PoseRecord] = []
-        self._finder = RestFinder(
-            self.sensor.rate_hz, len(self.sensor.axes), datasheet_noise(self.sensor), learn=True
-        )
+        rule = RestRule(datasheet_noise(self.sensor))
+        self._finder = RestFinder(self.sensor.rate_hz, len(self.sensor.axes), rule)
 
     def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Give samples to the search for rests."""
@@ -218,7 +219,7 @@ class HandRests(Guide):
         self._stamps = [np.concatenate(self._stamps)]
         stamps_ns = self._stamps[0]
         for rest in self._finder.rests():
-            mean_v, std_v = self._finder.means([rest])
+            found = self._finder.means([rest])[0]
             span = int(stamps_ns[rest.start]), int(stamps_ns[rest.stop - 1])
             yield guide.with_ambient(
                 PoseRecord(
@@ -226,8 +227,8 @@ class HandRests(Guide):
                     start_ns=span[0],
                     stop_ns=span[1],
                     samples=rest.stop - rest.start,
-                    mean_v=tuple(mean_v[0].tolist()),
-                    std_v=tuple(std_v[0].tolist()),
+                    mean_v=tuple(found.mean_v.tolist()),
+                    std_v=tuple(found.std_v.tolist()),
                 ),
                 self.readings,
             )

@@ -15,7 +15,7 @@ from adxl_ros.calibrate.joint_settings import angle_tolerance_rad, SettingTracke
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.rest_detection import Rest
+from adxl_ros.signals.rest_search import Rest
 import numpy as np
 
 _LONGEST_DWELL_S = 60.0

@@ -41,9 +41,6 @@ _HELD_OUT = 4  # One stay of so many is held out; chosen: a fifth to a third is 
 _FEWEST_HELD_OUT = 8  # Fewest stays that may decide; chosen: their scatter is known to a quarter
 _MOST_HELD_OUT = 400  # Most stays that are kept for that; chosen: some weeks
 _SURE = 0.99  # Confidence with which held-out stays must improve
-_HOLDS_DAYS = 1.0
-"""Days for which a change must surely improve, with the drift of that time: the next decision is
-as late as that."""
 _IMPLAUSIBLE = 3e-4
 """Probability below which a rest is not learnt; chosen: one false rest in months."""
 _REJECTED = 2
@@ -151,6 +148,7 @@ class Keeper:
         self._temperatures_c = [np.inf, -np.inf]
         self.newest_ns = 0
         self.last_temperature_c = np.nan
+        self._decides = False  # Whether to decide now, after the last rest
         self._begin(sensor)
         for entry in entries:
             self._take(entry)
@@ -161,7 +159,7 @@ class Keeper:
             return None
         self._write(rest)
         self._take(rest)
-        adopted = self._adoption() if self._is_due(rest.stop_ns) else None
+        adopted = self._adoption() if self._decides else None
         if adopted is None:
             return None
         self._proposal = self._describe(np.array(adopted.values))
@@ -224,6 +222,7 @@ class Keeper:
         """Count an entry, new or from the journal."""
         if isinstance(entry, NaturalRest):
             self._take_rest(entry)
+            self._decides = self._is_due(entry.stop_ns)
         elif isinstance(entry, Adopted):
             self._exchange(entry)
         elif isinstance(entry, Undone):
@@ -377,7 +376,7 @@ class Keeper:
         no rest has had up or down, a knock would not be noticed. So its zero-g stays as calibrated
         at the temperature of the calibration, and changes with temperature alone.
         """
-        mean, covariance = self._belief.aged(self._per_day, _HOLDS_DAYS).moments
+        mean, covariance = self._belief.moments
         designs = self._held_designs()
         upright = set()
         if self._kept.sensor.axes == AXES:

@@ -15,7 +15,9 @@ from dataclasses import replace
 
 from adxl_ros.files.sweep_journal import NaturalRest
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.rest_detection import datasheet_noise, Rest, RestFinder
+from adxl_ros.signals.rest_detection import RestFinder
+from adxl_ros.signals.rest_limits import datasheet_noise
+from adxl_ros.signals.rest_search import Rest, RestRule
 import numpy as np
 
 _WINDOW_NS = 30 * 10**9
@@ -93,13 +95,11 @@ class RestStream:
         if used.sum() < 2:
             self._goes_on = False
             return
-        finder = RestFinder(
-            self._sensor.rate_hz, volts.shape[1], datasheet_noise(self._sensor), learn=False
-        )
+        rule = RestRule(datasheet_noise(self._sensor), learns=False)
+        finder = RestFinder(self._sensor.rate_hz, volts.shape[1], rule)
         finder.feed(time_s[used], volts[used])
-        rests = finder.rests()
         goes_on = False
-        for rest, mean_v, std_v in zip(rests, *finder.means(rests)):
+        for rest, mean_v, std_v in finder.means(finder.rests()):
             found = self._natural(rest, mean_v, std_v, int(stamps_ns[0]))
             is_first = rest.time_start_s < _EDGE_S
             if not (is_first and self._goes_on and self._is_same(found)):

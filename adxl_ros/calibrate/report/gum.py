@@ -28,7 +28,7 @@ from adxl_ros.model.sensor import MARGIN_K, Sensor
 from adxl_ros.process import option
 from adxl_ros.report import templates
 from adxl_ros.report.quantities import mg, number
-from adxl_ros.signals.rest_detection import MOST_BATCHES
+from adxl_ros.signals.rest_means import MOST_BATCHES
 import numpy as np
 import scipy
 

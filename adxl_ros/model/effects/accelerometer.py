@@ -662,7 +662,7 @@ def bandwidth(signals: Signals, p: Parameters) -> None:
     cause='The zero-g follows the temperature; measure it and correct, or keep it steady.',
     diagnosis=DiagnosisHints(
         revealed_by=Manoeuvre.HEAT,
-        form=(FormDimension.TEMPERATURE,),
+        form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
         proof=(ProofVariable.TEMPERATURE,),
     ),
 )
@@ -702,7 +702,7 @@ def temperature_bias(signals: Signals, p: Parameters) -> None:
     cause='The scale factor follows the temperature; measure it and correct, or keep it steady.',
     diagnosis=DiagnosisHints(
         revealed_by=Manoeuvre.HEAT,
-        form=(FormDimension.TEMPERATURE,),
+        form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
         proof=(ProofVariable.TEMPERATURE,),
     ),
 )

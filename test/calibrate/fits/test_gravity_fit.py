@@ -11,7 +11,8 @@ from adxl_ros.files import recording
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
-from adxl_ros.signals.rest_detection import find_rests, rest_means
+from adxl_ros.signals.rest_detection import find_rests
+from adxl_ros.signals.rest_means import rest_means
 from hypothesis import given, settings, strategies
 from needs import lack
 import numpy as np

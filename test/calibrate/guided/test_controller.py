@@ -9,7 +9,7 @@ from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, St
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
-from adxl_ros.files.recording_columns import sensor_info, StreamInfo
+from adxl_ros.files.stream_info import sensor_info, StreamInfo
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.report.level import Level
 import numpy as np

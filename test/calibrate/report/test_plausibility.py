@@ -15,7 +15,7 @@ from units import nominal
 
 
 def any_imu() -> Sensor:
-    sensor = parameter_file.load(parameter_file.any_imu_path(), may_measure=True)
+    sensor = parameter_file.usual(is_nominal=False)
     return replace(sensor, noise_density_g_per_rthz=np.full(3, 4e-4), unstated=())
 
 
