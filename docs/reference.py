@@ -866,7 +866,7 @@ def pooled_limit(made: list[tuple[int, int, int] | None]) -> str:
         return '-'
     cases = sum(n for *_, n in made)
     low, high = (sum(limit[i] * limit[2] for limit in made) / cases for i in (0, 1))
-    return f'{low:.0f} to {high:.0f} %'
+    return f'{low:.0f} to {high:.0f} %, n = {cases}'
 
 
 def pooled(draws: list[Draw]) -> str:
