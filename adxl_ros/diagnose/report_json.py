@@ -7,9 +7,10 @@ import json
 from typing import Any, TYPE_CHECKING
 
 from adxl_ros.diagnose import report as words
+from adxl_ros.diagnose.next_experiment import MENU
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient, Effect
+from adxl_ros.model.effects.base import Coefficient, Effect, Manoeuvre
 from adxl_ros.model.sensor import fitted_of, get, parameter_of
 from adxl_ros.report.quantities import Interval
 import numpy as np
@@ -118,7 +119,11 @@ def _of_fault(diagnosis: Diagnosis) -> dict[str, Any]:
 def _proposal(proposal: NextExperiment) -> dict[str, Any]:
     """Return what to record next, with the worth of all manoeuvres."""
     menu = [
-        {'manoeuvre': w.name, 'minutes': w.minutes, 'nats_per_minute': w.per_minute}
+        {
+            'manoeuvre': MENU[Manoeuvre[w.name]].text,
+            'minutes': w.minutes,
+            'nats_per_minute': w.per_minute,
+        }
         for w in proposal.menu
     ]
     return {
