@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adxl_ros.diagnose import comparison as beside, linear_model as linear
-from adxl_ros.diagnose.comparison import Reference, with_values
+from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.evidence import LinearFit
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
@@ -33,7 +33,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern, Manoeuvre
-from adxl_ros.model.sensor import Sensor, with_neutral
+from adxl_ros.model.sensor import Sensor, with_neutral, with_values
 from adxl_ros.process import command
 from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
