@@ -221,7 +221,7 @@ def _evidence(search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int
         counts=counts,
         weights=rule.block_weights(seed),
         material_mps2=smallest_mps2,
-        reference_mps2=max(model.smallest_angle_rad() * G0_MPS2, robot_mps2),
+        reference_mps2=float(max(model.smallest_angle_rad() * G0_MPS2, robot_mps2)),
         errs_in_motion=robot_mps2 > 0,
         fades=any(c.fading_hz is not None for c in comparisons),
         wanders=any(getattr(c.motion.force, 'wanders', False) for c in comparisons),

@@ -72,7 +72,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 }
                 for r in report.could_show
             ],
-            'candidates': _candidates(report),
+            'candidates': candidates(report),
             'noise_remainders': [
                 {
                     'effect': r.effect,
@@ -177,8 +177,8 @@ def _gap(report: Report) -> dict[str, Any]:
     }
 
 
-def _candidates(report: Report) -> list[dict[str, Any]]:
-    """Return the effects of all hypotheses and detections, the most probable first."""
+def candidates(report: Report) -> list[dict[str, Any]]:
+    """Return the effects of all hypotheses and detections, the most probable first, unrounded."""
     verdict = report.verdict
     visible = {row.name.effect: row.share for row in report.could_show}
     shares = words.shares_of_gap(report)
@@ -188,6 +188,7 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
         hypothesis = next((h for h in report.hypotheses if name in h.effects), None)
         if not probabilities and hypothesis is None:
             continue
+        # The last one, where an effect is in two groups.
         group = next((g for g in reversed(verdict.groups) if name in g), ())
         out.append(
             {
@@ -254,9 +255,7 @@ def _key(name: Coefficient) -> str:
     return f'{name.parameter}.{name.axis}' if name.axis else name.parameter
 
 
-def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
+def named_effects(report: Report) -> list[str]:
     """Return the effects of the verdict by their share of the gap."""
-    shares = {c['effect']: c['share'] or 0.0 for c in objects['candidates']}
-    return sorted(
-        (name for name in report.verdict.named if name in shares), key=lambda name: -shares[name]
-    )
+    shares = words.shares_of_gap(report)
+    return sorted(report.verdict.named, key=lambda name: -shares.get(name, 0.0))

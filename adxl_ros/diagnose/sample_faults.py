@@ -91,29 +91,25 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     finite = np.isfinite(volts).all(axis=1)
     known = comparison.used | comparison.disturbed
     coarse = coarse_codes(volts, sensor)
-    changing = finite
     if coarse is None:
         repeats = repeated_samples(volts, time_s, finite, sensor)
-        changing = repeats.regular
-        detections = [*repeats.detections]
     else:
         # Coarse codes repeat by themselves.
-        detections = [coarse]
+        repeats = SampleSearch(finite, [coarse])
         sensor = coarse.added_to(sensor)
-    compared = changing & known
+    compared = repeats.regular & known
     lone = isolated_samples(volts, residual_v, time_s, compared, comparison.sensor)
     if lone.detections and coarse is None:
         isolated = compared & ~lone.regular
         repeats = repeated_samples(volts, time_s, finite, sensor, isolated)
-        changing = repeats.regular
-        detections = [*repeats.detections]
-        compared = changing & known
+        compared = repeats.regular & known
         lone = isolated_samples(volts, residual_v, time_s, compared, sensor)
+    detections = [*repeats.detections]
     held, clipping = _held(comparison)
     if clipping is not None:
-        detections = [*detections, clipping]
+        detections.append(clipping)
     return SampleFaults(
-        repeated=finite & ~changing,
+        repeated=finite & ~repeats.regular,
         isolated=compared & ~lone.regular,
         held=held,
         detections=detections,

@@ -268,20 +268,6 @@ class _BestSet(NamedTuple):
     repeats: bool = True  # Whether what repeats is no part of a drift
 
 
-class _InDrift(NamedTuple):
-    """The most probable set in noise that drifts."""
-
-    evidence: Evidence
-    best: frozenset[str]
-    nats: float  # By how much it is likelier than the most probable set in healthy noise
-
-    @classmethod
-    def of(cls, evidence: Evidence, healthy: frozenset[str]) -> _InDrift:
-        """Compare sets in the noise of the evidence."""
-        best = most_probable_set(evidence)
-        return cls(evidence, best, value_of(evidence.drift_nats(best, evidence.noise, healthy)))
-
-
 def _best_set(
     evidence: Evidence,
     remainder_of: Callable[[frozenset[str], str], Remainder],
@@ -295,19 +281,20 @@ def _best_set(
         sets = filter(None, minimal_sets(weighed))
         return replace(weighed, again={effects: simulate_again(effects) for effects in sets})
 
+    def nats(drifting: Evidence) -> float:
+        best = most_probable_set(drifting)
+        return value_of(drifting.drift_nats(best, drifting.noise, healthy))
+
     evidence = simulated(evidence)
     healthy = most_probable_set(evidence)
     # In noise that drifts, sets explain less than they seem to beside white noise. The motion
     # that a smooth reference lacks is no drift.
     every = () if evidence.fades else evidence.candidates[healthy]
-    in_drifts = []
-    for drift in every:
-        if drift != HEALTHY:
-            in_drifts.append(_InDrift.of(replace(evidence, noise=drift), healthy))
-    likeliest = max(in_drifts, key=lambda weighed: weighed.nats, default=None)
-    if likeliest is None or not is_drifting(likeliest.evidence, likeliest.best, healthy):
+    in_drifts = [replace(evidence, noise=drift) for drift in every if drift != HEALTHY]
+    likeliest = max(in_drifts, key=nats, default=None)
+    if likeliest is None or not is_drifting(likeliest, most_probable_set(likeliest), healthy):
         return _BestSet(evidence, healthy, remainder_of(healthy, HEALTHY))
-    evidence = simulated(likeliest.evidence)
+    evidence = simulated(likeliest)
     best = most_probable_set(evidence)
     remainder = remainder_of(best, evidence.noise)
     follows_more = evidence.follows(remainder, beside_form(best))
