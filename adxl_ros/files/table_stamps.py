@@ -21,7 +21,7 @@ from adxl_ros.files.column_mapping import (
 )
 from adxl_ros.files.stamp_check import StampCheck
 from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
-from adxl_ros.process import option, pasted
+from adxl_ros.wording import option, pasted
 import numpy as np
 
 _TIME_LIMIT_S = 9e9  # Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)

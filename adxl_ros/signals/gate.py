@@ -21,10 +21,10 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import recorded_nominal, Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.rest_detection import rests_of
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 

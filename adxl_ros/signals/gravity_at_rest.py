@@ -22,10 +22,10 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, TINY
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, number
 from adxl_ros.signals.reading_units import AXIS_UNITS, ReadingUnit, UNITS
 from adxl_ros.signals.tolerances import calibrated_tolerance, nominal_tolerance, Tolerance
+from adxl_ros.wording import option
 import numpy as np
 
 _NOISE_STDS = 5.0  # Largest error of a mean by noise, in its standard deviations

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import AXES
-from adxl_ros.process import option
 from adxl_ros.signals.rest_search import Rest
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.process import option
+from adxl_ros.wording import option
 
 _COUNTS_PER_G = [2**k for k in range(6, 19)]
 """Counts of 1 g of digital sensors: from 6 bits of ±2 g to 20 bits of ±2 g, by powers of two."""

@@ -14,8 +14,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components, Need
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.simulate.smoothed_path import PathErrors
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 

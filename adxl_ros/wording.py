@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""How texts name what their reader may give: options of tools, or arguments of verbs."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from enum import auto, Enum
+import os
+import re
+import shlex
+from typing import Any, NamedTuple
+
+NAMES_OPTIONS = 'ADXL_ROS_NAMES_OPTIONS'
+"""
+Environment variable that is set while a tool or a node runs: texts name options.
+
+Workers inherit it. Without it a program in Python runs, and texts name arguments.
+"""
+
+
+class Taker(Enum):
+    """What takes an argument in Python."""
+
+    VERB = auto()  # The verb that says the text
+    READ = auto()  # `read` or `from_arrays`, before another verb gets the recording
+    RESULT = auto()  # The result of a verb, whose method has the name of the argument
+
+
+class _Argument(NamedTuple):
+    """An argument that is no option `--its-name`, or that a verb does not take itself."""
+
+    option: str  # Option of the tools
+    taker: Taker = Taker.VERB
+
+
+_ARGUMENTS = {
+    'certificate': _Argument('--dcc', Taker.RESULT),
+    'report': _Argument('--report', Taker.RESULT),
+    'effects': _Argument('--effect'),
+    'quantity': _Argument('--in'),
+    'sensor': _Argument('--params'),
+    'topic': _Argument('--topic', Taker.READ),
+    'columns': _Argument('--columns', Taker.READ),
+    'unit': _Argument('--unit', Taker.READ),
+    'lsb_per_g': _Argument('--lsb-per-g', Taker.READ),
+    'lsb_at_0g': _Argument('--lsb-at-0g', Taker.READ),
+    'rate': _Argument('--rate', Taker.READ),
+    'axes': _Argument('--axes', Taker.READ),
+    'drop_bad_stamps': _Argument('--drop-bad-stamps', Taker.READ),
+    'drop_bad_samples': _Argument('--drop-bad-samples', Taker.READ),
+}
+"""Arguments that differ from the rule: a verb takes `some_name`, a tool `--some-name`."""
+READING = tuple(name for name, each in _ARGUMENTS.items() if each.taker is Taker.READ)
+"""Arguments of `read`, which are options of the tools that read recordings."""
+_UNQUOTED = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?|[A-Z]{2,}')
+"""Values without quotes in Python: numbers, and words in capitals, which stand for values."""
+
+
+@contextmanager
+def options_named() -> Iterator[None]:
+    """Let texts name options, because a tool or a node is running."""
+    is_inner = names_options()
+    os.environ[NAMES_OPTIONS] = '1'
+    try:
+        yield
+    finally:
+        if not is_inner:
+            del os.environ[NAMES_OPTIONS]
+
+
+def names_options() -> bool:
+    """Return whether texts name options, and no arguments."""
+    return NAMES_OPTIONS in os.environ
+
+
+def option(*names: str, **values: Any) -> str:
+    """
+    Return how a text names what its reader may give: `--unit g` to a tool, `unit='g'` to a verb.
+
+    names: what is named without a value; values: True for a switch, a list for an option that may
+    be repeated. Both have the names of the arguments in Python.
+    """
+    given = {**dict.fromkeys(names), **values}
+    if names_options():
+        return _options(given)
+    arguments = _arguments(given)
+    takers = {_argument(name).taker for name in given}
+    return f'read or from_arrays(..., {arguments})' if takers == {Taker.READ} else arguments
+
+
+def usage(verb: str, *inputs: str, **values: Any) -> str:
+    """Return how a verb is used with an option: `fit --means` as a tool, `fit(means=True)`."""
+    if names_options():
+        return ' '.join((verb, *inputs, _options(values)))
+    return f'{verb}({", ".join((*map(repr, inputs), _arguments(values)))})'
+
+
+def pasted(columns: str, **values: Any) -> str:
+    """Return options with a mapping of columns, which a shell or Python reads as they are."""
+    if names_options():
+        quoted = shlex.quote(columns)
+        columns = quoted if quoted != columns else f"'{columns}'"
+    return option(columns=columns, **values)
+
+
+def _argument(name: str) -> _Argument:
+    """Return the argument of a name in Python."""
+    return _ARGUMENTS.get(name) or _Argument(f'--{name.replace("_", "-")}')
+
+
+def _options(given: Mapping[str, Any]) -> str:
+    """Return values by argument as options of a tool."""
+    words: list[str] = []
+    for name, value in given.items():
+        flag = _argument(name).option
+        if isinstance(value, list):
+            words += [f'{flag} {each}' for each in value]
+        else:
+            words.append(flag if value is None or value is True else f'{flag} {value}')
+    return ' '.join(words)
+
+
+def _arguments(given: Mapping[str, Any]) -> str:
+    """Return values by argument as Python has them; a result has them in parentheses."""
+    words: list[str] = []
+    for name, value in given.items():
+        text = '' if value is None else repr(value)
+        if _UNQUOTED.fullmatch(str(value)):
+            text = str(value)
+        is_method = _argument(name).taker is Taker.RESULT
+        words.append(f'{name}({text})' if is_method else f'{name}={text}')
+    return ', '.join(words)
