@@ -27,30 +27,31 @@ class Taker(Enum):
 
 
 class _Argument(NamedTuple):
-    """An argument that is no option `--its-name`, or that a verb does not take itself."""
+    """How an argument differs from the rule: a verb takes `its_name`, and a tool `--its-name`."""
 
-    option: str  # Option of the tools
+    option: str = ''  # Option of the tools
     taker: Taker = Taker.VERB
 
 
+_OF_READ = _Argument(taker=Taker.READ)
 _ARGUMENTS = {
     'certificate': _Argument('--dcc', Taker.RESULT),
-    'report': _Argument('--report', Taker.RESULT),
+    'report': _Argument(taker=Taker.RESULT),
     'effects': _Argument('--effect'),
     'quantity': _Argument('--in'),
     'sensor': _Argument('--params'),
-    'topic': _Argument('--topic', Taker.READ),
-    'columns': _Argument('--columns', Taker.READ),
-    'unit': _Argument('--unit', Taker.READ),
-    'lsb_per_g': _Argument('--lsb-per-g', Taker.READ),
-    'lsb_at_0g': _Argument('--lsb-at-0g', Taker.READ),
-    'rate': _Argument('--rate', Taker.READ),
-    'axes': _Argument('--axes', Taker.READ),
-    'drop_bad_stamps': _Argument('--drop-bad-stamps', Taker.READ),
-    'drop_bad_samples': _Argument('--drop-bad-samples', Taker.READ),
+    'topic': _OF_READ,
+    'columns': _OF_READ,
+    'unit': _OF_READ,
+    'lsb_per_g': _OF_READ,
+    'lsb_at_0g': _OF_READ,
+    'rate': _OF_READ,
+    'axes': _OF_READ,
+    'drop_bad_stamps': _OF_READ,
+    'drop_bad_samples': _OF_READ,
 }
-"""Arguments that differ from the rule: a verb takes `some_name`, a tool `--some-name`."""
-READING = tuple(name for name, each in _ARGUMENTS.items() if each.taker is Taker.READ)
+"""Arguments that differ from the rule, by name."""
+READING = tuple(name for name, each in _ARGUMENTS.items() if each is _OF_READ)
 """Arguments of `read`, which are options of the tools that read recordings."""
 _UNQUOTED = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?|[A-Z]{2,}')
 """Values without quotes in Python: numbers, and words in capitals, which stand for values."""
@@ -104,15 +105,15 @@ def pasted(columns: str, **values: Any) -> str:
 
 
 def _argument(name: str) -> _Argument:
-    """Return the argument of a name in Python."""
-    return _ARGUMENTS.get(name) or _Argument(f'--{name.replace("_", "-")}')
+    """Return how an argument differs from the rule."""
+    return _ARGUMENTS.get(name, _Argument())
 
 
 def _options(given: Mapping[str, Any]) -> str:
     """Return values by argument as options of a tool."""
     words: list[str] = []
     for name, value in given.items():
-        flag = _argument(name).option
+        flag = _argument(name).option or f'--{name.replace("_", "-")}'
         if isinstance(value, list):
             words += [f'{flag} {each}' for each in value]
         else:
