@@ -4,7 +4,6 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from enum import auto, Enum
 import os
 import re
 import shlex
@@ -18,41 +17,36 @@ Workers inherit it. Without it a program in Python runs, and texts name argument
 """
 
 
-class Taker(Enum):
-    """What takes an argument in Python."""
-
-    VERB = auto()  # The verb that says the text
-    READ = auto()  # `read` or `from_arrays`, before another verb gets the recording
-    RESULT = auto()  # The result of a verb, whose method has the name of the argument
-
-
 class _Argument(NamedTuple):
-    """How an argument differs from the rule: a verb takes `its_name`, and a tool `--its-name`."""
+    """How an argument differs from the rule: a verb takes `its_name=`, and a tool `--its-name`."""
 
     option: str = ''  # Option of the tools
-    taker: Taker = Taker.VERB
+    in_python: str = '{}={}'  # Name and value for a verb, or for a method of its result
+    is_of_read: bool = False  # Whether `read` or `from_arrays` takes it before the verb
 
 
-_OF_READ = _Argument(taker=Taker.READ)
+READING = (
+    'topic',
+    'columns',
+    'unit',
+    'lsb_per_g',
+    'lsb_at_0g',
+    'rate',
+    'axes',
+    'drop_bad_stamps',
+    'drop_bad_samples',
+)
+"""Arguments of `read`, which are options of the tools that read recordings."""
+_METHOD = '{}({})'
 _ARGUMENTS = {
-    'certificate': _Argument('--dcc', Taker.RESULT),
-    'report': _Argument(taker=Taker.RESULT),
+    **dict.fromkeys(READING, _Argument(is_of_read=True)),
+    'certificate': _Argument('--dcc', _METHOD),
+    'report': _Argument(in_python=_METHOD),
     'effects': _Argument('--effect'),
     'quantity': _Argument('--in'),
     'sensor': _Argument('--params'),
-    'topic': _OF_READ,
-    'columns': _OF_READ,
-    'unit': _OF_READ,
-    'lsb_per_g': _OF_READ,
-    'lsb_at_0g': _OF_READ,
-    'rate': _OF_READ,
-    'axes': _OF_READ,
-    'drop_bad_stamps': _OF_READ,
-    'drop_bad_samples': _OF_READ,
 }
 """Arguments that differ from the rule, by name."""
-READING = tuple(name for name, each in _ARGUMENTS.items() if each is _OF_READ)
-"""Arguments of `read`, which are options of the tools that read recordings."""
 _UNQUOTED = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?|[A-Z]{2,}')
 """Values without quotes in Python: numbers, and words in capitals, which stand for values."""
 
@@ -85,8 +79,8 @@ def option(*names: str, **values: Any) -> str:
     if names_options():
         return _options(given)
     arguments = _arguments(given)
-    takers = {_argument(name).taker for name in given}
-    return f'read or from_arrays(..., {arguments})' if takers == {Taker.READ} else arguments
+    is_of_read = all(_argument(name).is_of_read for name in given)
+    return f'read or from_arrays(..., {arguments})' if is_of_read else arguments
 
 
 def usage(verb: str, *inputs: str, **values: Any) -> str:
@@ -128,6 +122,5 @@ def _arguments(given: Mapping[str, Any]) -> str:
         text = '' if value is None else repr(value)
         if _UNQUOTED.fullmatch(str(value)):
             text = str(value)
-        is_method = _argument(name).taker is Taker.RESULT
-        words.append(f'{name}({text})' if is_method else f'{name}={text}')
+        words.append(_argument(name).in_python.format(name, text))
     return ', '.join(words)
