@@ -287,7 +287,7 @@ class _Case:
     def _sphere_middle_mps2(self, prior: float) -> np.ndarray:
         """Return the middle of the sphere nearest to the readings, near 0 by a prior, (m,)."""
         mean = self.readings.mean_mps2
-        axes = self.readings.mean_mps2.shape[1]
+        axes = mean.shape[1]
         # |r|² = 2·r·b + (|f|² − |b|²) is linear in b and in the bracket.
         scale_mps2 = prior * 2 * self.gravity_mps2 * self.error_mps2.mean()
         near_0 = np.diag(scale_mps2 / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2))
