@@ -9,6 +9,9 @@ the question and its stages
     diagnosis           one call from recordings to a report: the stages below, in order
 the recording beside its simulation
     comparison          the baseline on the recorded motion, and the samples that count
+    reference_gaps      readings of the reference that are missing, and what bridges them
+    fast_motion         samples that move too fast for the reference
+    sample_faults       spikes, repeated samples and steps of codes
     data_faults         what a fault of the data is
     data_checks         the checks in order: corrected, left out or refused
     stamp_checks        stamps that are late or impossible
@@ -33,6 +36,8 @@ the decision
     verdict_sensor      the sensor with the effects of the verdict
     ideal_observer      how surely anybody could have said it
     noise_effects       effects that show in the noise alone
+    detection           what a detector finds
+    noise_remainders    the noise beside that of the simulation, before and after
 what a reader is told besides
     gap_closure         the gap before and after
     gap_in_unit         the gap as an angle, a velocity or a function

@@ -40,7 +40,7 @@ def script(turns=3):
 
 def made(sensor, turns=3, seed=3):
     path = script(turns)
-    columns = simulate(sensor, Motion(path.now, *path.joints()), seed)
+    columns = simulate(sensor, Motion(path.now_s, *path.joints()), seed)
     return Recording('made', columns.pop('time_s'), columns, sensor_info(sensor))
 
 
@@ -57,7 +57,7 @@ def ideal(tmp_path, late_s, name='sim.csv'):
     """Write the ideal force of the recording of `made`, with stamps that are late."""
     path = script()
     alpha, beta = path.joints()
-    time_s = np.arange(0, path.now, 0.01)
+    time_s = np.arange(0, path.now_s, 0.01)
     force = specific_force(alpha(time_s), beta(time_s), G0_MPS2)
     rows = np.column_stack([time_s + late_s, *force])
     np.savetxt(

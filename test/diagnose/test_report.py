@@ -34,7 +34,7 @@ def turning(alphas_rad=(np.pi / 2, np.pi / 4)):
                 script.rest(2.0)
                 script.run('beta', to, speed)
     script.rest(2.0)
-    return Motion(script.now, *script.joints())
+    return Motion(script.now_s, *script.joints())
 
 
 class Report:
