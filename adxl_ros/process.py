@@ -13,7 +13,7 @@ import select
 import signal
 import sys
 
-from adxl_ros.wording import option as option, usage as usage  # noqa: F401
+from adxl_ros.wording import option, usage  # noqa: F401
 
 NODES = (
     'driver',
