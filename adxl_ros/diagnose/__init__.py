@@ -15,8 +15,12 @@ the recording beside its simulation
     motion_shifts       by how much two motions are shifted in time
     simulator_time      the part of a recording that another simulator covers
     reference_checks    time, gravity and dynamics of the reference
+    reference_gaps      gaps between readings of a reference
+    fast_motion         motion that its readings do not show
     axis_checks         range, unit, sign and order of the axes
     encoder_checks      sign and unit of the angles of a stage
+    detection           an effect that shows in samples or in noise
+    sample_faults       samples that repeat, stand alone or are held
 the fit
     noise_floor         below which no model can predict a sample
     noise_filters       make the noise of an axis white
@@ -32,7 +36,8 @@ the decision
     verdict             what is said, and how surely
     verdict_sensor      the sensor with the effects of the verdict
     ideal_observer      how surely anybody could have said it
-    noise_effects       effects that show in the noise alone
+    noise_effects       a line of the mains, and a higher level of the noise
+    noise_remainders    recorded noise beside simulated noise
 what a reader is told besides
     gap_closure         the gap before and after
     gap_in_unit         the gap as an angle, a velocity or a function
