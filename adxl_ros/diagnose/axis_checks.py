@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from adxl_ros.diagnose.comparison import BaselineComparison, code_step_v, SMALLEST_MOTION_G
+from adxl_ros.diagnose.comparison import BaselineComparison, code_step_v
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.motion_shifts import CORRELATED
 from adxl_ros.diagnose.noise_effects import SMALLEST_RANGE_V
@@ -22,6 +22,7 @@ from adxl_ros.process import option
 from adxl_ros.report.quantities import listed
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.polarity import find_polarity_fault
+from adxl_ros.signals.stage_angles import SMALLEST_MOTION_G
 import numpy as np
 
 _FEWEST_SAMPLES = 50  # Fewest samples of any recording. Chosen: one for each of 48 blocks

@@ -27,6 +27,7 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import acceleration_text
 from adxl_ros.signals.block_statistics import held_values, true_runs
+from adxl_ros.signals.stage_angles import SMALLEST_MOTION_G
 from adxl_ros.simulate.motion import ForcePath, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.recorded_motion import environment_paths, motion_from_references
 from adxl_ros.simulate.response import ChainMemo, whole_response
@@ -34,9 +35,6 @@ from adxl_ros.simulate.smoothed_path import BAND_LIMITED_DEGREE, visible_step
 import numpy as np
 import scipy
 
-SMALLEST_MOTION_G = 0.05
-"""Standard deviation of the simulated force, g, from which an axis is compared. Chosen: ten times
-the noise of an ADXL203."""
 SEARCH_RATE_HZ = 125.0
 """Rate of the samples in the search, Hz. Chosen: motion up to 60 Hz. Samples are left out, never
 averaged, so that aliases remain."""
