@@ -76,7 +76,7 @@ def examine(
     look = RecordingLook(sensor, first)
     gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
     references = _References()
-    angles: list[StageReadings] = []
+    angle_fault = ''
     for block in chain([first], blocks):
         if not len(block):
             continue
@@ -85,11 +85,10 @@ def examine(
         if gyro is not None:
             gyro.feed(block)
         references.feed(block)
-        if block.stage_angles is not None:
-            readings = StageReadings.of(
-                block.stage_angles, block.volts(look.nominal), look.nominal
-            )
-            angles.append(readings)
+        if block.stage_angles is not None and not angle_fault:
+            volts = block.volts(look.nominal)
+            readings = StageReadings.of(block.stage_angles, volts, look.nominal)
+            angle_fault = readings.degrees_fault()
     gravity = look.gravity()
     rests = look.rests.detected
     spans_s = [found.rest.span_s for found in rests]
@@ -114,7 +113,7 @@ def examine(
         poses=_count_poses(means_mps2),
         gravity=gravity,
         neighbour_faults=tuple(look.faults()),
-        angle_fault=StageReadings.joined(angles).degrees_fault() if angles else '',
+        angle_fault=angle_fault,
         reference_ranges=references.ranges,
         reference_means=references.means,
         log_delay_s=log_delay_s,

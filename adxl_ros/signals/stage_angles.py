@@ -45,18 +45,8 @@ class StageReadings:
         """Return some of the readings of angles, (k, 2), and outputs, V, (k, m)."""
         measured_g = (volts - sensor.zero_g_v) / sensor.scale_v_per_g
         rows = np.flatnonzero(np.isfinite(np.hstack([angles_rad, measured_g])).all(axis=1))
-        return cls(angles_rad[rows], measured_g[rows]).thinned()
-
-    @classmethod
-    def joined(cls, parts: Sequence[StageReadings]) -> StageReadings:
-        """Return some of the readings of all parts, one at least."""
-        angles_rad = np.concatenate([part.angles_rad for part in parts])
-        return cls(angles_rad, np.concatenate([part.measured_g for part in parts])).thinned()
-
-    def thinned(self) -> StageReadings:
-        """Return every k-th reading, so that they are few."""
-        step = max(1, len(self.angles_rad) // _SAMPLES)
-        return StageReadings(self.angles_rad[::step], self.measured_g[::step])
+        rows = rows[:: max(1, len(rows) // _SAMPLES)]
+        return cls(angles_rad[rows], measured_g[rows])
 
     @property
     def variance_g2(self) -> float:
