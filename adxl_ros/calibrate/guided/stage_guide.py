@@ -196,7 +196,7 @@ class StageSweep(Guide):
 
     @property
     def _dwell_samples(self) -> int:
-        """Number of samples of a dwell."""
+        """Return the number of samples of a dwell."""
         return round(self.settings.dwell_s * self.sensor.rate_hz)
 
     def _is_complete(self, dwell: Dwell) -> bool:
