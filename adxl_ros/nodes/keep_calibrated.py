@@ -82,7 +82,6 @@ class _Receiver:
             node.create_client(SetParameters, f'{name}/set_parameters') if name else None
         )
         self._waiting: deque[Sensor] = deque()
-        self._answer: object = None
         self._due_s = 0.0
         self._number = 0
         self._was_there = False
