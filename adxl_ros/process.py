@@ -13,8 +13,6 @@ import select
 import signal
 import sys
 
-from adxl_ros.wording import option, usage  # noqa: F401
-
 NODES = (
     'driver',
     'stage',
