@@ -13,8 +13,6 @@ import select
 import signal
 import sys
 
-from adxl_ros.wording import option as option, usage as usage
-
 NODES = (
     'driver',
     'stage',

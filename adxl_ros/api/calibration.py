@@ -28,19 +28,21 @@ from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words, gyro_lines
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
-from adxl_ros.files.atomic_write import make_folder, require_own
+from adxl_ros.files.atomic_write import own_folder, require_own
 from adxl_ros.files.recording_columns import recorded_nominal, Recording
 from adxl_ros.files.stream_info import nominal_of
 from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.files.tables import read_pose_table
-from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.process import option
+from adxl_ros.model.constants import Z_90
+from adxl_ros.model.error_sizes import stds
+from adxl_ros.model.sensor import get, parameter_of, Sensor, with_axes
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS, QUIET_COLOUR
-from adxl_ros.report.quantities import mg
+from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, measured_lines
+from adxl_ros.wording import option
 
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
 _MEANS_LACK = (
@@ -55,9 +57,10 @@ class FittedCoefficient(NamedTuple):
     name: str  # 'effect.parameter', as in the parameter file
     axis: str  # x, y or z; '' for a coefficient of all axes
     label: str  # The coefficient in words
-    value: float  # In `unit`; zero-g and scale factor are absolute, V and V/g
+    value: float  # The parameter, in `unit`: an `offset` departs from the nominal value
     half_width: float  # Half of its 90 % interval, in `unit`
-    unit: str  # Degrees for an angle, else the unit of the parameter file
+    unit: str  # Unit of the parameter file
+    shown: str  # For people: zero-g and scale factor as a whole, angles in degrees
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -67,31 +70,46 @@ class Fit(Result):
 
     `print` shows the screen of the tool `fit`, a notebook the top of its page. Other verbs take
     it in place of the sensor.
+
+    Attributes
+    ----------
+    sensor
+        The unit with its fitted coefficients, their covariance and its validity range.
+    outcome
+        PASS, NOT SHOWN or FAIL: the calibration error against the limit of the datasheet.
+    coefficients
+        Fitted coefficients with the halves of their 90 % intervals.
+    held_out
+        Errors on poses that the fit has not seen, by model, the datasheet's first: rms, largest
+        and 90 % interval of `tilt_deg`, degrees, and of `accel_mg`, mg. Empty against gravity.
+    poses
+        Number of poses that were used.
+    outliers
+        Indices of the poses that the fit leaves out.
+    warnings
+        What is wrong with the poses or the fit, and why no richer model was fitted.
+    measured
+        What was measured, as no parameter file states it.
+    notes : tuple of str
+        Readings beyond the stated range, by recording, and what a table of means lacks.
+    is_over_temperature
+        Whether temperature effects were fitted to a sensor at rest.
+    result
+        All steps between the poses and the coefficients.
+
     """
 
     sensor: Sensor
-    """The unit with its fitted coefficients, their covariance and its validity range."""
     outcome: str
-    """PASS, NOT SHOWN or FAIL: the calibration error against the limit of the datasheet."""
     coefficients: tuple[FittedCoefficient, ...]
-    """Fitted coefficients with the halves of their 90 % intervals."""
     held_out: tuple[HeldOutErrors, ...]
-    """Errors on poses that the fit has not seen, by model, the datasheet's first: rms, largest
-    and 90 % interval of `tilt_deg`, degrees, and of `accel_mg`, mg. Empty against gravity."""
     poses: int
-    """Number of poses that were used."""
     outliers: tuple[int, ...]
-    """Indices of the poses that the fit leaves out."""
     warnings: tuple[str, ...]
-    """What is wrong with the poses or the fit, and why no richer model was fitted."""
     measured: tuple[str, ...]
-    """What was measured, as no parameter file states it."""
     notes: tuple[str, ...]
-    """Readings beyond the stated range, by recording, and what a table of means lacks."""
     is_over_temperature: bool
-    """Whether temperature effects were fitted to a sensor at rest."""
     result: CalibrationResult
-    """All steps between the poses and the coefficients."""
 
     @property
     def screen(self) -> list[str]:
@@ -143,8 +161,7 @@ class Fit(Result):
             raise UserError(
                 f'{option(report=folder)}: a fit over temperature has no page; leave it out'
             )
-        require_own(Path(folder) / page.PAGE, overwrite)
-        path = make_folder(folder)
+        path = own_folder(folder, [page.PAGE], overwrite)
         page.write(path, self.result, store)
         return path / page.PAGE
 
@@ -472,16 +489,21 @@ def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool = Fal
         warnings=[*result.warnings, *unit.assumed(fitted.effects)],
         details=[*result.details, *measured],
     )
+    names = fitted.covariance_names
+    half_widths = Z_90 * stds(fitted.covariance)
     coefficients = tuple(
         FittedCoefficient(
             name=row.name,
             axis=row.axis,
             label=row.label,
-            value=row.fitted,
-            half_width=row.half_width,
-            unit=row.unit,
+            value=float(value),
+            half_width=float(half_width),
+            unit=parameter_of(name).unit,
+            shown=f'{with_half_width(row.fitted, row.half_width)} {row.unit}',
         )
-        for row in compare(fitted, fitted)
+        for name, value, half_width, row in zip(
+            names, get(fitted, names), half_widths, compare(fitted, fitted)
+        )
     )
     return Fit(
         sensor=fitted,

@@ -24,7 +24,6 @@ from adxl_ros.api.result import (
     FirstScreen,
     no_progress,
     Progress,
-    require_number,
     Result,
 )
 from adxl_ros.api.sensors import as_input, sensor_of, SensorInput
@@ -33,10 +32,11 @@ from adxl_ros.diagnose.diagnosis import what_shows
 from adxl_ros.diagnose.screen import as_shown
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording as recording_files
-from adxl_ros.files.atomic_write import make_folder, require_own, write_text
+from adxl_ros.files.atomic_write import own_folder, require_own, write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.arguments import require_number
 from adxl_ros.report.screen import Tile
 from adxl_ros.signals import findings_report as words
 from adxl_ros.signals.findings import Ability, check_recording, Findings, Shown
@@ -63,15 +63,22 @@ class Check(Result):
     Whether recordings are sound.
 
     `print` shows the screen of the tool `check`.
+
+    Attributes
+    ----------
+    recordings
+        By recording: `faults`, `remarks`, `contents` (samples, rate, gaps, rests, ranges),
+        `abilities` of the verbs, and for a single one what `diagnose` could show, `shows`.
+    outcomes
+        By recording: whether it is sound, what became worse since `against`, and the `minima`.
+    against
+        Name of the recording that all are compared with; '' for none.
+
     """
 
     recordings: tuple[Findings, ...]
-    """By recording: `faults`, `remarks`, `contents` (samples, rate, gaps, rests, ranges),
-    `abilities` of the verbs, and for a single one what `diagnose` could show, `shows`."""
     outcomes: tuple[tuple[Outcome, ...], ...]
-    """By recording: whether it is sound, what became worse since `against`, and the `minima`."""
     against: str
-    """Name of the recording that all are compared with; '' for none."""
 
     @property
     def is_sound(self) -> bool:
@@ -147,8 +154,7 @@ class Check(Result):
         overwrite: whether a page is replaced that this package did not write, or that was
         changed since.
         """
-        require_own(Path(folder) / words.PAGE, overwrite)
-        path = make_folder(folder) / words.PAGE
+        path = own_folder(folder, [words.PAGE], overwrite) / words.PAGE
         write_text(path, words.page(self.recordings, self.first_screen._asdict()))
         return path
 

@@ -28,13 +28,13 @@ from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import base, effect_named
 from adxl_ros.model.gyroscope import Gyroscope, NO_TURN
 from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.process import option
 from adxl_ros.report.figures import axes_for
 from adxl_ros.report.quantities import mg
 from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, measured_lines
+from adxl_ros.wording import option
 import numpy as np
 
 BLOCK_ROWS = 8192  # Samples that are corrected at a time (chosen: their arrays stay in the cache)
@@ -233,37 +233,54 @@ class Corrected(Result):
 
     What a sample does not determine is NaN, and its standard deviation is inf. The standard
     deviations hold noise, quantisation, and the uncertainty of the calibration.
+
+    Attributes
+    ----------
+    time_s
+        Stamps, s since `epoch_ns`, (n,).
+    epoch_ns
+        Origin of the stamps, ns since 1970; 0 where they count from a start.
+    force_mps2
+        Specific force in the frame of the case (REP-103), m/s², (n, 3): +g upward at rest.
+    force_std_mps2
+        Its standard deviations, m/s², (n, 3).
+    force_covariance
+        Its covariance, (m/s²)², (n, 3, 3); very large for an axis that is not measured.
+    columns
+        Columns of the tool's table, (n,) each: the force as `ax_mps2`, `ax_std_mps2`, ..., m/s²,
+        and the angles `roll_rad`, `pitch_rad`, `inclination_rad`, and `alpha_rad`, `beta_rad` as a
+        stage has them, with `roll_std_rad`, ..., rad. Angles hold at rest. A gyroscope without its
+        bias is `gx_radps`, `gx_std_radps`, ..., rad/s.
+    at_rail
+        Whether the ADC is at a rail, (n,) bool.
+    outside
+        Whether temperature or force lie outside of the calibrated range, (n,) bool.
+    unsolved
+        Whether no force explains the sample, (n,) bool.
+    sensor
+        The sensor that the samples were corrected by.
+    notes : tuple of str
+        Effects that stay, and how many samples are at a rail, outside or without a solution.
+    screen_lines
+        What the tool shows.
+    parts
+        Samples and estimates, block by block.
+
     """
 
     time_s: np.ndarray
-    """Stamps, s since `epoch_ns`, (n,)."""
     epoch_ns: int
-    """Origin of the stamps, ns since 1970; 0 where they count from a start."""
     force_mps2: np.ndarray
-    """Specific force in the frame of the case (REP-103), m/s², (n, 3): +g upward at rest."""
     force_std_mps2: np.ndarray
-    """Its standard deviations, m/s², (n, 3)."""
     force_covariance: np.ndarray
-    """Its covariance, (m/s²)², (n, 3, 3); very large for an axis that is not measured."""
     columns: Mapping[str, np.ndarray]
-    """Columns of the tool's table, (n,) each: the force as `ax_mps2`, `ax_std_mps2`, ..., m/s²,
-    and the angles `roll_rad`, `pitch_rad`, `inclination_rad`, and `alpha_rad`, `beta_rad` as a
-    stage has them, with `roll_std_rad`, ..., rad. Angles hold at rest. A gyroscope without its
-    bias is `gx_radps`, `gx_std_radps`, ..., rad/s."""
     at_rail: np.ndarray
-    """Whether the ADC is at a rail, (n,) bool."""
     outside: np.ndarray
-    """Whether temperature or force lie outside of the calibrated range, (n,) bool."""
     unsolved: np.ndarray
-    """Whether no force explains the sample, (n,) bool."""
     sensor: Sensor
-    """The sensor that the samples were corrected by."""
     notes: tuple[str, ...]
-    """Effects that stay, and how many samples are at a rail, outside or without a solution."""
     screen_lines: tuple[str, ...]
-    """What the tool shows."""
     parts: tuple[CorrectedPart, ...]
-    """Samples and estimates, block by block."""
 
     @property
     def screen(self) -> list[str]:

@@ -24,7 +24,6 @@ from adxl_ros.api.result import (
     FirstScreen,
     no_progress,
     Progress,
-    require_least,
     Result,
 )
 from adxl_ros.api.sensors import sensor_of, SensorInput
@@ -38,17 +37,18 @@ from adxl_ros.diagnose.screen import screen_lines
 from adxl_ros.diagnose.self_check import diagnose_again
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import make_folder, require_own, write_text
+from adxl_ros.files.atomic_write import own_folder, write_text
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
+from adxl_ros.report.arguments import require_least, require_path, require_whole
 from adxl_ros.report.figures import AFTER_COLOUR, axes_for, BEFORE_COLOUR, QUIET_COLOUR
 from adxl_ros.report.quantities import Interval, mg
 from adxl_ros.report.screen import NextStep
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.recorded_motion import motion_from_force
+from adxl_ros.wording import option
 
 PAGE = 'report.html'  # File of the page of a diagnosis
 REPORT = 'report.json'  # File of the figures
@@ -94,39 +94,57 @@ class Gap(Result):
     The gap between recordings and their simulation.
 
     `print` shows the screen of the tool `diagnose`, a notebook the top of its page.
+
+    Attributes
+    ----------
+    verdict
+        no_gap, explained, partly, inseparable or unknown; without a verdict insufficient or
+        bad_data.
+    probability
+        How often such verdicts were right in the working cases, 0 to 1; a `fault` is certain, 1.
+    surest
+        How sure of the effects an ideal observer could be; None unless `limit` asks for it, and
+        without effects on the mean.
+    effects
+        Effects of the verdict, those with the largest share of the gap first.
+    figures
+        The figures from which the verdict follows; None after `fault`.
+    could_show
+        Smallest size of each effect that would have shown, in the unit of its parameter.
+    sensor
+        What the simulator shall model: the given sensor with the effects that were found.
+    fault
+        Why a recording cannot be compared; '' where it can.
+    summary
+        Verdict and figures in a few sentences.
+    notes : tuple of str
+        What was corrected or left out.
+    in_unit
+        The gap in the unit that `quantity` names; None where none was asked for.
+    remarks
+        What was assumed of temperature, supply and power-on; and the prior, and the result of the
+        self-check, where they were asked for.
+    compared
+        What was compared with what.
+    diagnosis
+        All steps between the recordings and the verdict.
+
     """
 
     verdict: str
-    """no_gap, explained, partly, inseparable or unknown; without a verdict insufficient or
-    bad_data."""
     probability: float
-    """How often such verdicts were right in the working cases, 0 to 1; a `fault` is certain, 1."""
     surest: Surest | None
-    """How sure of the effects an ideal observer could be; None unless `limit` asks for it, and
-    without effects on the mean."""
     effects: tuple[FoundEffect, ...]
-    """Effects of the verdict, those with the largest share of the gap first."""
     figures: GapFigures | None
-    """The figures from which the verdict follows; None after `fault`."""
     could_show: tuple[CouldShow, ...]
-    """Smallest size of each effect that would have shown, in the unit of its parameter."""
     sensor: Sensor
-    """What the simulator shall model: the given sensor with the effects that were found."""
     fault: str
-    """Why a recording cannot be compared; '' where it can."""
     summary: str
-    """Verdict and figures in a few sentences."""
     notes: tuple[str, ...]
-    """What was corrected or left out."""
     in_unit: GapInUnit | None
-    """The gap in the unit that `quantity` names; None where none was asked for."""
     remarks: tuple[str, ...]
-    """What was assumed of temperature, supply and power-on; and the prior, and the result of the
-    self-check, where they were asked for."""
     compared: Compared
-    """What was compared with what."""
     diagnosis: Diagnosis
-    """All steps between the recordings and the verdict."""
 
     @property
     def fault_name(self) -> str:
@@ -215,10 +233,8 @@ class Gap(Result):
         one that repeats the diagnosis. overwrite: whether files are replaced that this package
         did not write, or that were changed since.
         """
-        texts = self.documents(folder, made_by)
-        for name in texts:
-            require_own(Path(folder) / name, overwrite)
-        path = make_folder(folder)
+        texts = self.documents(require_path(folder), made_by)
+        path = own_folder(folder, texts, overwrite)
         for name, text in texts.items():
             write_text(path / name, text)
         return [path / name for name in (PAGE, PARAMETERS, REPORT) if name in texts]
@@ -316,8 +332,8 @@ def diagnose(
         An argument is wrong, a file cannot be read, or recordings are of several units.
 
     """
-    require_least('seed', seed, 0)
-    require_least('self_check', self_check, 0)
+    require_whole('seed', seed)
+    require_whole('self_check', self_check)
     require_least('material', material, 1e-6)
     _require_simulator(sim, sim_unit, urdf, align)
     unit = quantity_named(quantity) if quantity else None

@@ -16,7 +16,7 @@ from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Res
 from adxl_ros.api.sensors import as_input, SensorInput
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording as recording_files
-from adxl_ros.files.atomic_write import make_folder, require_own, write_bytes
+from adxl_ros.files.atomic_write import own_folder, require_own, write_bytes
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.tables import BLOCK_ROWS
@@ -38,28 +38,41 @@ class Noise(Result):
     The noise of a sensor in the longest rest of a recording.
 
     `print` shows the screen of the tool `noise`. Other verbs take it in place of the sensor.
+
+    Attributes
+    ----------
+    axes
+        By axis: `fit.white` N, m/s²/√Hz; `fit.instability` B, m/s²; `fit.walk` K, m/s²/√s, each
+        with `value`, `low` and `high` of its 90 % interval; `sample_std` and `resolution`, m/s².
+        N² is the density over positive and negative frequencies.
+    span_s
+        Time at rest, s.
+    rate_hz
+        Sample rate by the stamps, Hz.
+    tau_s
+        Averaging times of the Allan deviation, s, (k,).
+    allan_deviation_mps2
+        Allan deviation of each axis, m/s², (k, m).
+    gyro
+        The gyroscope by axis, as `axes` in rad/s; empty without one.
+    gyro_allan_deviation_radps
+        Allan deviation of the gyroscope at `tau_s`, rad/s, (k, 3); (k, 0) without one.
+    warnings
+        What is not seen, what hides it, and how long to record.
+    result
+        All steps between the samples and the noise.
+
     """
 
     axes: tuple[AxisNoise, ...]
-    """By axis: `fit.white` N, m/s²/√Hz; `fit.instability` B, m/s²; `fit.walk` K, m/s²/√s, each
-    with `value`, `low` and `high` of its 90 % interval; `sample_std` and `resolution`, m/s². N²
-    is the density over positive and negative frequencies."""
     span_s: float
-    """Time at rest, s."""
     rate_hz: float
-    """Sample rate by the stamps, Hz."""
     tau_s: np.ndarray
-    """Averaging times of the Allan deviation, s, (k,)."""
     allan_deviation_mps2: np.ndarray
-    """Allan deviation of each axis, m/s², (k, m)."""
     gyro: tuple[AxisNoise, ...]
-    """The gyroscope by axis, as `axes` in rad/s; empty without one."""
     gyro_allan_deviation_radps: np.ndarray
-    """Allan deviation of the gyroscope at `tau_s`, rad/s, (k, 3); (k, 0) without one."""
     warnings: tuple[str, ...]
-    """What is not seen, what hides it, and how long to record."""
     result: RecordingNoise
-    """All steps between the samples and the noise."""
 
     @cached_property
     def sensor(self) -> Sensor:
@@ -129,9 +142,7 @@ class Noise(Result):
 
         overwrite: as `save`.
         """
-        for name in (PLOT, TABLE):
-            require_own(Path(folder) / name, overwrite)
-        path = make_folder(folder)
+        path = own_folder(folder, [PLOT, TABLE], overwrite)
         write_bytes(path / PLOT, png(words.curves(self.result)))
         with csv_writer(path / TABLE) as append:
             append(self.curve())

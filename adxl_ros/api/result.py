@@ -7,11 +7,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 import math
-from numbers import Real
 from typing import Any, NamedTuple
 
-from adxl_ros.errors import UserError
-from adxl_ros.process import option
 from adxl_ros.report.screen import end_lines, Tile
 import numpy as np
 
@@ -81,17 +78,3 @@ class Result:
             f'<b>{escape(top.word)}</b> {escape(top.sentence)}</div>'
             f'<table><tr>{tiles}</tr></table>'
         )
-
-
-def require_number(argument: str, value: object) -> None:
-    """Refuse what is no number, in words of an argument; None is not given."""
-    if value is not None and not isinstance(value, Real):
-        raise UserError(f'{argument}: must be a number')
-
-
-def require_least(name: str, value: float | None, least: float) -> None:
-    """Refuse what is no number, or too small; None is not given."""
-    argument = option(**{name: value})
-    require_number(argument, value)
-    if value is not None and not value >= least:
-        raise UserError(f'{argument}: must be at least {least:g}')

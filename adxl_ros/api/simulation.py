@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 
 from adxl_ros.api.recordings import one_recording, read_ideal, RecordingInput
-from adxl_ros.api.result import no_progress, Progress, require_least, require_number
+from adxl_ros.api.result import no_progress, Progress
 from adxl_ros.api.sensors import (
     AddedEffects,
     as_input,
@@ -27,11 +27,12 @@ from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option, usage
+from adxl_ros.report.arguments import require_number, require_whole
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion
 from adxl_ros.simulate.recorded_motion import motion_from_force, motion_from_references
 from adxl_ros.simulate.response import simulate_blocks
 from adxl_ros.simulate.trajectories import TRAJECTORIES
+from adxl_ros.wording import option, usage
 import numpy as np
 
 IMU = 'imu'  # Trajectory of the specific force of another simulator
@@ -83,7 +84,7 @@ def prepare(
     seed: int = 0,
 ) -> Simulation:
     """Check what is to be simulated, and return it; see `simulate`."""
-    require_least('seed', seed, 0)
+    require_whole('seed', seed)
     require_number(usage('simulate', rate=rate), rate)
     bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
     if rate is not None and not bounds['lower'] <= rate <= bounds['upper']:

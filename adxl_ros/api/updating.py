@@ -16,7 +16,6 @@ from adxl_ros.api.result import (
     FirstScreen,
     no_progress,
     Progress,
-    require_number,
     Result,
 )
 from adxl_ros.api.sensors import as_input, load, SensorInput
@@ -26,14 +25,15 @@ from adxl_ros.calibrate.keep.stays import RestStream
 from adxl_ros.calibrate.keep.update_report import UpdatedDay
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.atomic_write import make_folder, require_own, write_text
+from adxl_ros.files.atomic_write import own_folder, require_own, write_text
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
+from adxl_ros.report.arguments import require_number
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import counted, number, utc
 from adxl_ros.report.screen import Tile
+from adxl_ros.wording import option
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -42,22 +42,33 @@ class Update(Result):
     A calibration after the rests of recordings.
 
     `print` shows the screen of the tool `fit --update`.
+
+    Attributes
+    ----------
+    before
+        The calibration that was given.
+    sensor
+        The calibration in use at the end, with the covariance of its error then.
+    outcome
+        ADOPTED, CHANGED (beyond what age and temperature explain) or KEPT.
+    days
+        What was known on each day with rests.
+    state
+        What is known at the end.
+    counts
+        Rests that were used, and rests without a temperature, which were not.
+    adoptions
+        Number of adoptions.
+
     """
 
     before: Sensor
-    """The calibration that was given."""
     sensor: Sensor
-    """The calibration in use at the end, with the covariance of its error then."""
     outcome: str
-    """ADOPTED, CHANGED (beyond what age and temperature explain) or KEPT."""
     days: tuple[UpdatedDay, ...]
-    """What was known on each day with rests."""
     state: KeptState
-    """What is known at the end."""
     counts: Mapping[str, int]
-    """Rests that were used, and rests without a temperature, which were not."""
     adoptions: int
-    """Number of adoptions."""
 
     @property
     def screen(self) -> list[str]:
@@ -113,8 +124,7 @@ class Update(Result):
 
     def report(self, folder: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write the page report.html into a folder, and return its path."""
-        require_own(Path(folder) / words.PAGE, overwrite)
-        path = make_folder(folder) / words.PAGE
+        path = own_folder(folder, [words.PAGE], overwrite) / words.PAGE
         top = self.first_screen._asdict()
         write_text(path, words.page(self.sensor, self.days, self.state, top))
         return path

@@ -27,10 +27,11 @@ from adxl_ros.model.error_sizes import rms, stds
 from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals import filter_noise, polarity
 from adxl_ros.signals.gravity_at_rest import of_volts, require_unit
+from adxl_ros.signals.stage_angles import StageReadings
+from adxl_ros.wording import option
 import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
@@ -178,6 +179,8 @@ def _against_stage(
 ) -> CalibrationResult:
     sensor, source, data_sha256, population, doubts = given
     poses = Poses.joined([recording.poses for recording in recordings])
+    for recording in recordings:
+        _require_radians(sensor, recording)
     _check_polarity(sensor, poses)
     fit = _richest_fit(sensor, poses.subset(~poses.check), recordings, model, effects)
     if population is not None:
@@ -223,6 +226,14 @@ def _against_stage(
         warnings=[*warnings, *fit.notes],
         details=details,
     )
+
+
+def _require_radians(sensor: Sensor, recording: RecordedPoses) -> None:
+    """Refuse stage angles in degrees."""
+    poses = recording.poses
+    angles_rad = np.column_stack([poses.alpha_rad, poses.beta_rad])
+    if fault := StageReadings.of(angles_rad, poses.volts, sensor).degrees_fault():
+        raise UserError(f'{recording.source}: {fault}')
 
 
 def _check_polarity(sensor: Sensor, poses: Poses) -> None:

@@ -19,12 +19,12 @@ from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.files.tables import PoseTable
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.signals import filter_noise
 from adxl_ros.signals.rest_detection import recording_finder
 from adxl_ros.signals.rest_limits import datasheet_noise
 from adxl_ros.signals.rest_means import rest_means
 from adxl_ros.signals.rest_search import Rest
+from adxl_ros.wording import option
 import numpy as np
 
 _MAX_PERIODS = 1.5
@@ -34,6 +34,9 @@ _MIN_SAMPLES = 0.9
 _SHORTEST_SPAN_S = 0.5
 """Shortest rest of a table, s: ten blocks, whose scatter shows the error of the mean within a
 quarter. Half of them would show it within a third."""
+
+_MOST_MEANS = 2000
+"""Largest number of rows of a table of means. Chosen: a sweep of a working day, 15 s a pose."""
 
 
 def _named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Rest]:
@@ -170,6 +173,11 @@ def poses_of_means(recording: Recording, sensor: Sensor) -> Poses:
     The noise of the means is not known. Against gravity, 0 stands for it, and the residuals show
     it; against a stage, it is at most that of a sample.
     """
+    if len(recording) > _MOST_MEANS:
+        raise UserError(
+            f'{recording.path}: has {len(recording)} rows, more than {_MOST_MEANS} rests: its '
+            f'rows are samples, and no means; leave {option("means")} out'
+        )
     volts = recording.volts(sensor)
     columns = recording.columns
     missing = np.full(len(recording), np.nan)

@@ -9,17 +9,18 @@ the question and its stages
     diagnosis           one call from recordings to a report: the stages below, in order
 the recording beside its simulation
     comparison          the baseline on the recorded motion, and the samples that count
-    reference_gaps      readings of the reference that are missing, and what bridges them
-    fast_motion         samples that move too fast for the reference
-    sample_faults       spikes, repeated samples and steps of codes
     data_faults         what a fault of the data is
     data_checks         the checks in order: corrected, left out or refused
     stamp_checks        stamps that are late or impossible
     motion_shifts       by how much two motions are shifted in time
     simulator_time      the part of a recording that another simulator covers
     reference_checks    time, gravity and dynamics of the reference
+    reference_gaps      gaps between readings of a reference
+    fast_motion         motion that its readings do not show
     axis_checks         range, unit, sign and order of the axes
     encoder_checks      sign and unit of the angles of a stage
+    detection           an effect that shows in samples or in noise
+    sample_faults       samples that repeat, stand alone or are held
 the fit
     noise_floor         below which no model can predict a sample
     noise_filters       make the noise of an axis white
@@ -35,9 +36,8 @@ the decision
     verdict             what is said, and how surely
     verdict_sensor      the sensor with the effects of the verdict
     ideal_observer      how surely anybody could have said it
-    noise_effects       effects that show in the noise alone
-    detection           what a detector finds
-    noise_remainders    the noise beside that of the simulation, before and after
+    noise_effects       a line of the mains, and a higher level of the noise
+    noise_remainders    recorded noise beside simulated noise
 what a reader is told besides
     gap_closure         the gap before and after
     gap_in_unit         the gap as an angle, a velocity or a function

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from adxl_ros.diagnose.comparison import BaselineComparison, SMALLEST_MOTION_G
+from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.motion_shifts import CORRELATED
 from adxl_ros.diagnose.reference_checks import check_delay, LARGEST_DELAY_S
@@ -18,10 +18,11 @@ from adxl_ros.diagnose.sample_faults import code_step_v, SMALLEST_RANGE_V
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.sensor import to_nominal_mps2
-from adxl_ros.process import option
 from adxl_ros.report.quantities import listed
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.polarity import find_polarity_fault
+from adxl_ros.signals.stage_angles import SMALLEST_MOTION_G
+from adxl_ros.wording import option
 import numpy as np
 
 _FEWEST_SAMPLES = 50  # Fewest samples of any recording. Chosen: one for each of 48 blocks

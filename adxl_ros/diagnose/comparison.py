@@ -30,9 +30,6 @@ from adxl_ros.simulate.response import ChainMemo, whole_response
 import numpy as np
 import scipy
 
-SMALLEST_MOTION_G = 0.05
-"""Standard deviation of the simulated force, g, from which an axis is compared. Chosen: ten times
-the noise of an ADXL203."""
 SEARCH_RATE_HZ = 125.0
 """Rate of the samples in the search, Hz. Chosen: motion up to 60 Hz. Samples are left out, never
 averaged, so that aliases remain."""

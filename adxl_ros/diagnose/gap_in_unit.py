@@ -13,7 +13,7 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 

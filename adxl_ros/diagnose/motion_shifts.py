@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
-from adxl_ros.diagnose.comparison import SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.stage_angles import SMALLEST_MOTION_G
 from adxl_ros.simulate.motion import ForcePath
 import numpy as np
 import scipy

@@ -17,7 +17,6 @@ from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.report.quantities import mg_text
 from adxl_ros.signals import gravity_at_rest, tolerances
 from adxl_ros.signals.block_statistics import bridged
@@ -26,6 +25,7 @@ from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.signals.rest_means import rest_means
 from adxl_ros.signals.rest_search import RestRule
 from adxl_ros.simulate.motion import ForcePath
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 

@@ -12,10 +12,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
-from adxl_ros.diagnose.comparison import BaselineComparison, leave_out, SMALLEST_MOTION_G
+from adxl_ros.diagnose.comparison import BaselineComparison, leave_out
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.files.reference_track import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.stage_angles import SMALLEST_MOTION_G
 from adxl_ros.simulate.smoothed_path import visible_step
 import numpy as np
 

@@ -14,11 +14,11 @@ from adxl_ros.diagnose.report_json import as_json, named_effects
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Need
 from adxl_ros.model.sensor import parameter_of
-from adxl_ros.process import option
 from adxl_ros.report import quantities
 from adxl_ros.report.quantities import mg_text, percent
 from adxl_ros.report.screen import COLUMNS, wrapped
 from adxl_ros.signals.findings import Shown
+from adxl_ros.wording import option
 
 if TYPE_CHECKING:
     from adxl_ros.diagnose.diagnosis import Diagnosis, Report

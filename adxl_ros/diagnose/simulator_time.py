@@ -30,8 +30,8 @@ from adxl_ros.diagnose.motion_shifts import (
 from adxl_ros.diagnose.stamp_checks import has_every_sample
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.simulate.motion import ForcePath, Motion
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 import ctypes
 import errno
@@ -19,6 +19,7 @@ import tempfile
 from typing import BinaryIO
 
 from adxl_ros.errors import UserError
+from adxl_ros.report.arguments import require_path
 from adxl_ros.wording import option
 
 AnyPath = str | os.PathLike  # A path, as the functions of Python take it
@@ -123,7 +124,7 @@ def _refuse_folder_of_others(path: Path) -> None:
 
 def require_own(path: AnyPath, may_overwrite: bool = False) -> None:
     """Refuse to replace what others wrote or changed, unless the user permits it."""
-    target = Path(path)
+    target = require_path(path)
     if may_overwrite or not target.exists():
         return
     is_empty_folder = target.is_dir() and not any(target.iterdir())
@@ -161,6 +162,13 @@ def make_folder(folder: AnyPath) -> Path:
     except OSError as error:
         raise UserError(f'{path}: cannot be made: {error.strerror}') from None
     return path
+
+
+def own_folder(folder: AnyPath, names: Iterable[str], may_overwrite: bool) -> Path:
+    """Create a folder for files that replace nothing of others, unless permitted; return it."""
+    for name in names:
+        require_own(require_path(folder) / name, may_overwrite)
+    return make_folder(folder)
 
 
 def remove_unfinished(folder: AnyPath, name: str) -> None:

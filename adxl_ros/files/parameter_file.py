@@ -21,6 +21,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.sensor import coefficients_of, Envelope, neutral, Sensor
+from adxl_ros.report.arguments import require_path
 import numpy as np
 import yaml
 
@@ -101,7 +102,7 @@ def _params_folder() -> Path:
 
 def installed_path(name: AnyPath) -> Path:
     """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
-    path = Path(name)
+    path = require_path(name)
     may_be_name = path.name == str(name) and not path.suffix
     if path.exists() or not may_be_name:
         return path

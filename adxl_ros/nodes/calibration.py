@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.calibrate.guided import controller, pose_plan
-from adxl_ros.calibrate.guided.controller import ControllerState, RequestAnswer
+from adxl_ros.calibrate.guided.controller import ControllerState, RequestAnswer, StartMode
 from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
@@ -369,10 +369,10 @@ class Calibration(Node):
         start = self._controller.start
         requests: dict[str, Callable[[], RequestAnswer]] = {
             'start': start,
-            'resume': partial(start, start_over=False),
-            'start_over': partial(start, start_over=True),
-            'redo': partial(self._controller.change_pose, 'redo'),
-            'skip': partial(self._controller.change_pose, 'skip'),
+            'resume': partial(start, StartMode.CONTINUE),
+            'start_over': partial(start, StartMode.ANEW),
+            'redo': self._controller.redo,
+            'skip': self._controller.skip,
             'finish': self._controller.finish,
             'abort': self._controller.abort,
         }
@@ -404,6 +404,7 @@ class Calibration(Node):
             raise SystemExit(0 if self._controller.outcome else 1)
 
     def _status(self) -> Status:
+        self._controller.log_obstacle()
         report = self._controller.report()
         level = Level.WARN if report.status.late else Level.OK
         if self._samples.mixture():

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import termios
 
-from adxl_ros.calibrate.guided.controller import Controller, ControllerState, IDLE_TEXT
+from adxl_ros.calibrate.guided.controller import Controller, ControllerState, IDLE_TEXT, StartMode
 from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, ScreenContents, ScreenRow
 from adxl_ros.nodes.jobs import executable, held_output
 from adxl_ros.nodes.topics import create_publisher, STEADY
@@ -133,7 +133,7 @@ class DisplayPublisher:
             self._node.count_clients('~/resume')
         )
         if controller.state is ControllerState.ASKING and not controller.may_ask:
-            controller.start(start_over=False)
+            controller.start(StartMode.CONTINUE)
         controller.shows_idle_stream = bool(self._publisher.get_subscription_count())
         if controller.shows_idle_stream:
             status = controller.status()

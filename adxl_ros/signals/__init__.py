@@ -16,6 +16,7 @@ gravity and axes at rest
     reading_units         units in place of m/s²
     gravity_at_rest       the length of gravity, and what explains another one
     polarity              axes that are inverted or swapped
+    stage_angles          whether the angles of a stage explain the output
     axis_ranges           axes at the end of their range, or stuck
     neighbouring_samples  repeated, interleaved, wrapped and single wrong samples
     gyroscope_at_rest     the bias of a gyroscope

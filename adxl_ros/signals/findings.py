@@ -41,6 +41,7 @@ zero-g is then 0.1 mg."""
 _SHOWING_V = 0.1  # The same of the supply, V
 FEWEST_GRAVITY_POSES = 7  # Orientations of a fit of six parameters against gravity: one more
 SHORTEST_MOTION_S = 30.0  # Shortest recording on a moving stage that `diagnose` compares, s
+_IN_DEGREES = 'has stage angles in degrees'  # Why no tool can use them
 _FEWEST_STAGE_POSES = 4  # Orientations of a linear fit. Chosen: both ends of two axes
 
 
@@ -85,6 +86,8 @@ def assess(contents: RecordingContents) -> Findings:
     faults = [*_stamp_faults(contents), *contents.neighbour_faults]
     if contents.gravity.fault:
         faults.append(contents.gravity.fault.text)
+    if contents.angle_fault:
+        faults.append(contents.angle_fault)
     if contents.gyro:
         faults += contents.gyro.faults
     return Findings(
@@ -145,6 +148,8 @@ def _stage_range_rad(contents: RecordingContents) -> float | None:
 
 def _fit(contents: RecordingContents) -> Ability:
     """Return whether enough orientations rest for a calibration."""
+    if contents.angle_fault:
+        return Ability('fit', False, _IN_DEGREES)
     held = f'{counted(contents.poses, "orientation")} in {counted(contents.rests, "rest")}'
     if _stage_range_rad(contents) is not None:
         if contents.poses >= _FEWEST_STAGE_POSES:
@@ -165,6 +170,8 @@ def _fit(contents: RecordingContents) -> Ability:
 
 def _diagnose(contents: RecordingContents) -> Ability:
     """Return whether the motion of a stage, or a change of its surroundings, shows effects."""
+    if contents.angle_fault:
+        return Ability('diagnose', False, _IN_DEGREES)
     range_rad = _stage_range_rad(contents)
     has_moved = range_rad is not None and range_rad > _MOVED_RAD
     if contents.poses <= 1 and not has_moved:

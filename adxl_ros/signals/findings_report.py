@@ -27,7 +27,7 @@ HEAD = ('recording', 'length', 'rate', 'missing', 'rest', 'axes', 'verdict')
 _COLUMNS = (_NAME_COLUMNS, '>12', '>12', '>8', '>8', '>6', 11)
 _SHOWS_HEAD = ('effect', 'from', 'typical', '')
 _SHOWS_COLUMNS = (24, 16, 14)
-_NOT_IN_CONTENTS = ('path', 'remarks', 'cut', 'gravity', 'neighbour_faults')
+_NOT_IN_CONTENTS = ('path', 'remarks', 'cut', 'gravity', 'neighbour_faults', 'angle_fault')
 """Fields of the contents that have another place in the JSON."""
 
 

@@ -21,6 +21,7 @@ from adxl_ros.signals.gravity_at_rest import GravityAtRest
 from adxl_ros.signals.gyroscope_turns import GyroFindings, GyroLook
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.rest_search import Rest
+from adxl_ros.signals.stage_angles import StageReadings
 from adxl_ros.wording import option
 import numpy as np
 
@@ -49,6 +50,7 @@ class RecordingContents:
     poses: int  # Number of different orientations among them
     gravity: GravityAtRest  # The length of gravity over the rests
     neighbour_faults: tuple[str, ...]  # What is wrong between neighbouring samples
+    angle_fault: str  # Which stage angles are in degrees; '' for none
     # Lowest and highest value of each reference, by column
     reference_ranges: dict[str, tuple[float, float]]
     reference_means: dict[str, float]  # Mean of each reference, by column
@@ -74,6 +76,7 @@ def examine(
     look = RecordingLook(sensor, first)
     gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
     references = _References()
+    angle_fault = ''
     for block in chain([first], blocks):
         if not len(block):
             continue
@@ -82,6 +85,10 @@ def examine(
         if gyro is not None:
             gyro.feed(block)
         references.feed(block)
+        if block.stage_angles is not None and not angle_fault:
+            volts = block.volts(look.nominal)
+            readings = StageReadings.of(block.stage_angles, volts, look.nominal)
+            angle_fault = readings.degrees_fault()
     gravity = look.gravity()
     rests = look.rests.detected
     spans_s = [found.rest.span_s for found in rests]
@@ -106,6 +113,7 @@ def examine(
         poses=_count_poses(means_mps2),
         gravity=gravity,
         neighbour_faults=tuple(look.faults()),
+        angle_fault=angle_fault,
         reference_ranges=references.ranges,
         reference_means=references.means,
         log_delay_s=log_delay_s,

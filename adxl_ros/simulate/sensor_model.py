@@ -31,6 +31,7 @@ from adxl_ros.model.sensor import (
     with_neutral,
 )
 from adxl_ros.model.signal_chain import Chain
+from adxl_ros.report.arguments import require_number, require_whole
 from adxl_ros.simulate.gyroscope_model import GyroscopeModel
 from adxl_ros.simulate.host_arrays import chosen, like, of_each, on_host
 from adxl_ros.simulate.motion import check_needs, lagrange_weights, Motion, POINTS
@@ -300,6 +301,7 @@ class SensorModel:
         """Refuse a call that does not continue the last one."""
         if not force.ndim or force.ndim > 2 or force.shape[-1] != 3:
             raise UserError(f'specific force has the shape {force.shape}; expected (3,) or (n, 3)')
+        require_number(f'dt is {dt_s!r}', dt_s)
         if not dt_s > 0:
             raise UserError(f'dt is {dt_s} s; it must be positive')
         if not np.isfinite(force).all():
@@ -386,6 +388,7 @@ class SensorNoise:
 
 def _generators(seed: int) -> list[np.random.Generator]:
     """Return the random generators of the units and of the white noise."""
+    require_whole('seed', seed)
     return [np.random.default_rng([seed, part]) for part in (1, 0)]
 
 

@@ -14,7 +14,6 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from adxl_ros.api import recordings
-from adxl_ros.api.result import require_least
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import AnyPath, require_own
@@ -22,6 +21,7 @@ from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
 from adxl_ros.process import ended_by_closed_output
+from adxl_ros.report.arguments import require_least
 from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser, wrapped
 from adxl_ros.wording import option, options_named, READING
 

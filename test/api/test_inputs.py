@@ -103,6 +103,23 @@ def test_no_array_is_refused_in_words_of_a_shell(call, named: str) -> None:
     refused(call, named)
 
 
+@pytest.mark.parametrize(
+    'call, named',
+    [
+        (lambda: adxl.simulate('rich', seed=1.5), 'seed=1.5'),
+        (lambda: adxl.SensorModel('adxl203', seed='a'), "seed='a'"),
+        (lambda: adxl.SensorModel('adxl203').reset(seed=-1), 'seed=-1'),
+        (lambda: adxl.SensorModel('adxl203')(np.zeros(3), 'a'), "dt is 'a'"),
+        (lambda: adxl.load(5), '5: is no path'),
+        (lambda: RECORDING.save(5), '5: is no path'),
+        (lambda: adxl.check(RECORDING).save(5), '5: is no path'),
+        (lambda: adxl.check(RECORDING).junit(5), '5: is no path'),
+    ],
+)
+def test_what_is_no_seed_no_time_step_and_no_path_is_named(call, named: str) -> None:
+    refused(call, named)
+
+
 @pytest.mark.parametrize('verb', VERBS)
 def test_a_verb_refuses_what_is_no_recording_and_no_sensor(verb) -> None:
     for given in (np.zeros((5, 3)), 5, None):

@@ -3,8 +3,11 @@
 """The verbs of `import adxl_ros` on a simulated unit: what results hold, show and write."""
 
 import copy
+import dataclasses
+import inspect
 import json
 import pickle
+import re
 
 import adxl_ros as adxl
 from matplotlib.figure import Figure
@@ -13,6 +16,7 @@ import pandas as pd
 import pytest
 
 G_MPS2 = 9.80665
+MISALIGNED_RAD = 0.02  # Misalignment of x that is simulated
 BIAS_V = 0.01  # Largest departure of the zero-g that is simulated, 10 mg
 
 
@@ -42,8 +46,10 @@ def gap(recording: adxl.Recording) -> adxl.Gap:
 
 def test_a_fit_finds_the_zero_g_and_saves_itself(fit, tmp_path) -> None:
     (zero_g,) = [row for row in fit.coefficients if (row.name, row.axis) == ('bias.offset_v', 'x')]
-    nominal = adxl.load('adxl203').nominal_zero_g_v[0]
-    assert abs(zero_g.value - nominal - BIAS_V) < 3 * zero_g.half_width
+    assert abs(zero_g.value - BIAS_V) < 3 * zero_g.half_width and zero_g.unit == 'V'
+    assert zero_g.value == fit.sensor.values['bias']['offset_v'][0]
+    whole_v = fit.sensor.nominal_zero_g_v[0] + zero_g.value
+    assert float(zero_g.shown.split()[0]) == pytest.approx(whole_v, abs=zero_g.half_width)
     assert fit.poses + len(fit.outliers) == len(fit.result.poses)
     fit.save(tmp_path / 'unit.yaml')
     np.testing.assert_allclose(
@@ -56,6 +62,45 @@ def test_a_fit_finds_the_zero_g_and_saves_itself(fit, tmp_path) -> None:
     assert len(table) == len(fit.coefficients) and set(table.unit) == {'V', 'V/g'}
     values = json.loads(json.dumps(fit.to_dict(), allow_nan=False))
     assert values['coefficients'][0]['unit'] == 'V'
+
+
+@pytest.mark.parametrize('names', [['alpha_rad', 'beta_rad'], ['beta_rad']])
+def test_stage_angles_in_degrees_are_named_by_each_verb(recording, names) -> None:
+    columns = {**recording.columns}
+    for name in names:
+        columns[name] = np.degrees(columns[name])
+    in_degrees = adxl.from_arrays(time_s=recording.time_s, **columns)
+    mend = f'multiply {" and ".join(names)} by π/180'
+    for model in (None, 'linear'):
+        with pytest.raises(adxl.UserError, match=f'arrays: {names[0]}.*{mend}'):
+            adxl.fit(in_degrees, 'adxl203', model=model)
+    checked = adxl.check(in_degrees, 'adxl203')
+    assert not checked.is_sound and checked.faults[0].endswith(mend)
+    is_able = {ability.tool: ability.is_able for ability in checked.recordings[0].abilities}
+    assert not is_able['fit'] and not is_able['diagnose']
+    assert adxl.diagnose(in_degrees, 'adxl203').summary.rstrip('.').endswith(mend)
+    assert adxl.check(recording, 'adxl203').is_sound
+
+
+def test_an_angle_among_the_coefficients_is_in_the_unit_of_its_name() -> None:
+    unit = adxl.load('adxl203', effects={'misalignment': {'beta_rad.x': MISALIGNED_RAD}})
+    recording = adxl.simulate('rich', unit, rate=25)
+    table = adxl.fit(recording, 'adxl203', model='physical').to_pandas()
+    (row,) = table[(table.name == 'misalignment.beta_rad') & (table.axis == 'x')].itertuples()
+    assert row.unit == 'rad' and abs(row.value - MISALIGNED_RAD) < 3 * row.half_width
+    assert row.shown.endswith('°')
+
+
+def test_samples_are_no_means_of_rests(recording) -> None:
+    with pytest.raises(adxl.UserError, match='are samples, and no means; leave means= out'):
+        adxl.fit(recording, 'adxl203', means=True)
+
+
+@pytest.mark.parametrize('verb', ['Fit', 'Gap', 'Corrected', 'Noise', 'Update', 'Check'])
+def test_help_names_each_field_of_a_result(verb: str) -> None:
+    attributes = inspect.getdoc(getattr(adxl, verb)).partition('Attributes\n')[2]
+    named = re.findall(r'^([a-z]\w*)', attributes, re.MULTILINE)
+    assert named == [field.name for field in dataclasses.fields(getattr(adxl, verb))]
 
 
 def test_corrected_arrays_follow_the_stage(recording, fit, tmp_path) -> None:

@@ -42,7 +42,7 @@ from adxl_ros.model.effects.base import Coefficient, Place, Role
 from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import coefficients_of, get, parameter_of, put, Sensor, with_neutral
-from adxl_ros.process import usage
+from adxl_ros.wording import usage
 import numpy as np
 import scipy
 
@@ -284,7 +284,7 @@ class _StageSearch:
 
     def _solved(self, poses: Poses, steps: int) -> _Iterate:
         """Take Gauss-Newton steps without step control: the chain is nearly linear in them."""
-        sizes = _sizes(self._names)
+        sizes = typical_sizes(self._names)
 
         def linearise(values: np.ndarray) -> _Iterate:
             about = self._about(put(self._sensor, self._names, values), poses)
@@ -430,7 +430,7 @@ def fisher_information(
     return about.information(about.covariance(stage))
 
 
-def _sizes(names: Sequence[Coefficient]) -> np.ndarray:
+def typical_sizes(names: Sequence[Coefficient]) -> np.ndarray:
     """Return the typical sizes of coefficients, (p,)."""
     return np.array([parameter_of(name).scale for name in names])
 
@@ -460,7 +460,7 @@ def open_coefficients(
     sensor: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
 ) -> list[Coefficient]:
     """Return the sensor's coefficients that poses leave as uncertain as their typical size."""
-    scale = _sizes(names)
+    scale = typical_sizes(names)
     is_required = np.array(
         [
             not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
@@ -506,7 +506,7 @@ def next_poses(
 ) -> str:
     """Name the poses of a 15° grid that would help most (D-optimality; Fedorov 1972), in deg."""
     grid = optimal_poses.candidate_poses(np.median(poses.std_v, axis=0))
-    scale = _sizes(names)
+    scale = typical_sizes(names)
     rows = optimal_poses.whitened_jacobian(sensor, grid, tuple(names), stage) * scale
     information = fisher_information(sensor, poses, names, stage) * np.outer(scale, scale)
     chosen = optimal_poses.choose_poses(

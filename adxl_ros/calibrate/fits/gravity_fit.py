@@ -24,8 +24,8 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.error_sizes import variances_of
 from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.sensor import parameter_of, Sensor
-from adxl_ros.process import option, usage
 from adxl_ros.report.quantities import mg
+from adxl_ros.wording import option, usage
 import numpy as np
 import scipy
 

@@ -13,7 +13,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import coefficients_of, get, Sensor
-from adxl_ros.process import usage
+from adxl_ros.wording import usage
 import numpy as np
 
 AFFINE = ('bias', 'scale_factor', 'misalignment')

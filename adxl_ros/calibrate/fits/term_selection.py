@@ -18,7 +18,6 @@ from itertools import chain
 from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.full_model import (
-    _sizes,
     belongs_to_stage,
     default_terms,
     effect_of,
@@ -29,6 +28,7 @@ from adxl_ros.calibrate.fits.full_model import (
     next_poses,
     prior_precision,
     term_of,
+    typical_sizes,
 )
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
 from adxl_ros.calibrate.poses import Poses
@@ -36,8 +36,8 @@ from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import library
 from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import get, parameter_of, Sensor, with_neutral
-from adxl_ros.process import usage
 from adxl_ros.report.quantities import with_half_width
+from adxl_ros.wording import usage
 import numpy as np
 import scipy
 
@@ -199,7 +199,7 @@ def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str
 def _weakest_direction(fitted: Sensor) -> str:
     """Name the direction that the poses determine least, in typical sizes, and the condition."""
     names = fitted.covariance_names
-    scale = _sizes(fitted.covariance_names)
+    scale = typical_sizes(fitted.covariance_names)
     values, vectors = np.linalg.eigh(fitted.covariance / np.outer(scale, scale))
     weakest = vectors[:, -1]
     parts = ' '.join(

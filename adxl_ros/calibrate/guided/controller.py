@@ -4,11 +4,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import auto, Enum
 from typing import NamedTuple, Protocol
 
 from adxl_ros.calibrate.fits.gravity_fit import NINE
-from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, STALE_NS
+from adxl_ros.calibrate.guided.guide import Guide, NewestSamples, NextPose, STALE_NS
 from adxl_ros.calibrate.guided.rest_guides import ENOUGH_RESTS
 from adxl_ros.calibrate.guided.screen_contents import GuideStatus, Phase
 from adxl_ros.calibrate.guided.session import GravityError, Session, SessionSettings
@@ -31,6 +32,17 @@ class ControllerState(Enum):
     WAITING_FOR_SENSOR = auto()
     ASKING = auto()  # The operator, what to do with an interrupted calibration
     RUNNING = auto()
+
+
+class StartMode(Enum):
+    """What a start does with an interrupted calibration."""
+
+    ASK = 'ask'
+    """Ask an operator at a screen; without one, continue."""
+    CONTINUE = 'continue'
+    """Go on with its poses."""
+    ANEW = 'anew'
+    """Put its poses aside."""
 
 
 class RequestAnswer(NamedTuple):
@@ -186,9 +198,8 @@ class Controller:
         self.outcome: tuple[str, ...] = ()  # Lines on the calibration that ended last
         self.may_ask = False  # Whether somebody is at a screen who can be asked
         self.shows_idle_stream = False  # Whether a screen shows samples without a calibration
-        # Whether to put an interrupted calibration aside; None asks an operator at a screen
-        self._by_default = {'ask': None, 'continue': False, 'anew': True}[resume]
-        self._starts_over = self._by_default
+        self._usual_start = StartMode(resume)
+        self._start = self._usual_start  # That of the newest request
         self._sensor = sensor
         self._samples = samples
         self._outputs = outputs
@@ -197,15 +208,15 @@ class Controller:
         self._accepted = 0
         self._has_doubt = False
 
-    def start(self, start_over: bool | None = None) -> RequestAnswer:
-        """Begin a calibration, or resume an interrupted one, as soon as the sensor is known."""
+    def start(self, mode: StartMode | None = None) -> RequestAnswer:
+        """Begin or resume a calibration as soon as the sensor is known; None is as usual."""
         if self.session is not None:
             return RequestAnswer(False, 'a calibration is running; finish or abort it first')
-        if self.state is ControllerState.ASKING and start_over is None:
+        if self.state is ControllerState.ASKING and mode is None:
             return RequestAnswer(False, self.question)
         self.state = ControllerState.WAITING_FOR_SENSOR
         self.question = ''
-        self._starts_over = self._by_default if start_over is None else start_over
+        self._start = mode or self._usual_start
         return self._try_to_start()
 
     def capture(self) -> RequestAnswer:
@@ -227,17 +238,26 @@ class Controller:
             self._say(Level.WARN, obstacle)
         return RequestAnswer(not obstacle, obstacle or 'averaging')
 
-    def change_pose(self, request: str) -> RequestAnswer:
-        """Take the previous pose again ('redo'), or leave out the open one ('skip')."""
+    def redo(self) -> RequestAnswer:
+        """Take the previous pose again."""
+        return self._change_pose(lambda guide: guide.redo, 'no pose to take again')
+
+    def skip(self) -> RequestAnswer:
+        """Leave out the open pose."""
+        return self._change_pose(lambda guide: guide.skip, 'no pose to leave out')
+
+    def _change_pose(
+        self, request_of: Callable[[Guide], Callable[..., str]], nothing: str
+    ) -> RequestAnswer:
+        """Let the guide carry out a request; `nothing` says that there is no such pose."""
         if self.session is None:
             return _NOT_RUNNING
         try:
-            text = getattr(self.session.guide, request)(self.session.journal.append)
+            text = request_of(self.session.guide)(self.session.journal.append)
         except UserError as error:
             return RequestAnswer(False, f'{error}')
         if not text:
-            what = {'redo': 'take again', 'skip': 'leave out'}[request]
-            return RequestAnswer(False, f'no pose to {what}')
+            return RequestAnswer(False, nothing)
         self.fit_fault = ''
         self._outputs.answer_captures(RequestAnswer(False, text))
         self._say(Level.OK, text)
@@ -297,7 +317,7 @@ class Controller:
             if changes and session.nominal.measured and not session.accepted_count:
                 self._stop(Level.OK, 'sensor_info has come: the calibration begins again with it')
                 self.stream.adopt(nominal)
-                self.start(start_over=True)
+                self.start(StartMode.ANEW)
                 return
             if changes:
                 self._stop(
@@ -359,30 +379,28 @@ class Controller:
         """Return what the calibration waits for."""
         stream = self.stream
         if self.state is ControllerState.ASKING:
-            return GuideStatus(Phase.QUESTION, self.question, True)
+            return GuideStatus(Phase.QUESTION, self.question, late=True)
         if self.state is ControllerState.WAITING_FOR_SENSOR:
             if stream.fault:
-                return GuideStatus(Phase.REFUSED, stream.fault, True)
+                return GuideStatus(Phase.REFUSED, stream.fault, late=True)
             silence = self._samples.silence()
             obstacle = (
                 f'{silence}; is the driver running?'
                 if silence
                 else 'without it, 2 s of samples show the sensor'
             )
-            return GuideStatus(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
+            return GuideStatus(Phase.INFO, f'waiting for sensor_info; {obstacle}', late=True)
         if self.session is None:
             hints = IDLE_TEXT, stream.outlook, self._samples.silence()
-            return GuideStatus(
-                Phase.IDLE, self._newest_line or '; '.join(filter(None, hints)), False
-            )
+            return GuideStatus(Phase.IDLE, self._newest_line or '; '.join(filter(None, hints)))
         if silence := self._samples.silence():
-            return GuideStatus(Phase.SILENT, silence, True)
+            return GuideStatus(Phase.SILENT, silence, late=True)
         if fault := self.session.fault or self.fit_fault:
-            return GuideStatus(Phase.REFUSED, fault, True)
+            return GuideStatus(Phase.REFUSED, fault, late=True)
         return self.session.guide.status()
 
     def report(self) -> Report:
-        """Return the state; log an obstacle once for each pose."""
+        """Return the state."""
         status = self.status()
         nominal = self.stream.nominal
         session = self.session
@@ -402,13 +420,18 @@ class Controller:
             tilt_rad = guide.tilt_error_rad()
             if np.isfinite(tilt_rad):
                 values['tilt_error_deg'] = float(np.degrees(tilt_rad))
-        if status.late:
-            # The times in its text change.
-            obstacle = f'{status.phase.value} {session.accepted_count if session else ""}'
-            if obstacle != self._warned and status.text != self._newest_line:
-                self._outputs.log(Level.WARN, status.text)
-            self._warned = obstacle
         return Report(status, nominal.serial if nominal else '', values)
+
+    def log_obstacle(self) -> None:
+        """Log an obstacle that lasts, once for each pose."""
+        status = self.status()
+        if not status.late:
+            return
+        # The times in its text change.
+        obstacle = f'{status.phase.value} {self.session.accepted_count if self.session else ""}'
+        if obstacle != self._warned and status.text != self._newest_line:
+            self._outputs.log(Level.WARN, status.text)
+        self._warned = obstacle
 
     def _try_to_start(self) -> RequestAnswer:
         """Begin a session if the sensor is known and the operator has nothing to answer."""
@@ -416,13 +439,13 @@ class Controller:
         if nominal is None:
             return RequestAnswer(True, 'starts when sensor_info comes, or samples show the sensor')
         try:
-            if self.may_ask and self._starts_over is None:
+            if self.may_ask and self._start is StartMode.ASK:
                 self.question = self.settings.question(nominal)
             if self.question:
                 self.state = ControllerState.ASKING
                 return RequestAnswer(False, self.question)
             self.session = session = Session(
-                nominal, self.settings, bool(self._starts_over), self._sensor
+                nominal, self.settings, self._start is StartMode.ANEW, self._sensor
             )
         except UserError as error:
             return RequestAnswer(False, self._stop(Level.ERROR, f'{error}'))

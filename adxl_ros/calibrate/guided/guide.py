@@ -369,6 +369,10 @@ class Guide:
         append(PoseDropped(number))
         return self.forget(number)
 
+    def skip(self, append: Callable[[JournalEntry], None]) -> str:
+        """Leave out the open pose, in the journal first; return a line for people, or ''."""
+        raise NotImplementedError
+
     def forget(self, number: int) -> str:
         """Forget a pose; return a line for people."""
         raise NotImplementedError

@@ -254,10 +254,10 @@ class HandGuide(HandRests):
         stillness = self._finder.stillness()
         rests = f'{count} rests ({_advice(count)})'
         if stillness is None:
-            return GuideStatus(Phase.REST, f'{rests}; waiting for samples', False)
+            return GuideStatus(Phase.REST, f'{rests}; waiting for samples')
         phase = Phase.DWELL if stillness.at_rest else Phase.REST
         return GuideStatus(
-            phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; {self.destination()}', False
+            phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; {self.destination()}'
         )
 
     def progress(self) -> list[ScreenRow]:

@@ -67,7 +67,7 @@ class GuideStatus:
 
     phase: Phase  # What it waits for
     text: str  # One line with the values that matter
-    late: bool  # Whether somebody should look: it waits for long, or refuses its input
+    late: bool = False  # Whether somebody should look: it waits for long, or refuses its input
 
 
 @dataclass(frozen=True)

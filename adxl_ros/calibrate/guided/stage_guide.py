@@ -174,39 +174,61 @@ class StageSweep(Guide):
     def accept(self) -> PoseRecord | None:
         """Return the pose for the journal when a full dwell at rest is complete, else None."""
         target = self.course.target
-        settings = self.settings
         dwell = self.dwell
-        samples = round(settings.dwell_s * self.sensor.rate_hz)
-        if (
-            target is None
-            or dwell is None
-            or len(dwell) < samples
-            or (self.uses_encoder and self.encoder.clock_fault())
-        ):
+        if target is None or dwell is None or not self._is_complete(dwell):
             return None
-        rest = dwell.full_rest(samples)
+        rest = dwell.full_rest(self._dwell_samples)
         if rest is None:
-            age_s = len(dwell) / self.sensor.rate_hz
-            if age_s > _LONGEST_DWELL_S + 2 * settings.dwell_s and not dwell.at_rest():
-                self.restart_dwell()
+            self._restart_if_long(dwell)
             return None
-        record = dwell.record(self.course.index, rest, samples)
+        record = dwell.record(self.course.index, rest, self._dwell_samples)
         if self.uses_encoder and (self.encoder.newest_ns or 0) < record.stop_ns:
-            silence = self.encoder.silence(self.now_ns)
-            if silence and settings.stage_mode is StageMode.ENCODER:
-                self.refuse(f'{silence}; capture again when it is back')
+            self._refuse_silence()
             return None
+        record = self._with_stage(record, target)
+        if refusal := _fault(self, record, dwell, rest):
+            self.refuse(refusal)
+            return None
+        if self.to_verify:
+            _verify_mounting(self, record)
+            return None
+        return record
+
+    @property
+    def _dwell_samples(self) -> int:
+        """Return the number of samples of a dwell."""
+        return round(self.settings.dwell_s * self.sensor.rate_hz)
+
+    def _is_complete(self, dwell: Dwell) -> bool:
+        """Return whether a dwell has its samples, and angles are of the same clock."""
+        has_fault = self.uses_encoder and self.encoder.clock_fault()
+        return len(dwell) >= self._dwell_samples and not has_fault
+
+    def _restart_if_long(self, dwell: Dwell) -> None:
+        """Drop the samples of a sensor that has moved for too long."""
+        age_s = len(dwell) / self.sensor.rate_hz
+        is_long = age_s > _LONGEST_DWELL_S + 2 * self.settings.dwell_s
+        if is_long and not dwell.at_rest():
+            self.restart_dwell()
+
+    def _refuse_silence(self) -> None:
+        """Refuse a capture whose encoder has fallen silent; other stages are waited for."""
+        silence = self.encoder.silence(self.now_ns)
+        if silence and self.settings.stage_mode is StageMode.ENCODER:
+            self.refuse(f'{silence}; capture again when it is back')
+
+    def _with_stage(self, record: PoseRecord, target: Target) -> PoseRecord:
+        """Return the record of a rest with its surroundings, and the angles of the stage."""
         span = record.start_ns, record.stop_ns
-        alpha_rad, beta_rad = target.alpha_rad, target.beta_rad
+        angles_rad = target.alpha_rad, target.beta_rad
         if self.uses_encoder:
             readings_rad = self.tracker.between(*span)
-            alpha_rad, beta_rad = (
-                readings_rad.mean(axis=0).tolist()
-                if len(readings_rad)
-                else self.encoder.angles_rad or (alpha_rad, beta_rad)
-            )
+            angles_rad = self.encoder.angles_rad or angles_rad
+            if len(readings_rad):
+                angles_rad = readings_rad.mean(axis=0).tolist()
+        alpha_rad, beta_rad = angles_rad
         alpha, beta = self.tracker.settings(*span, alpha_rad, beta_rad)
-        record = replace(
+        return replace(
             guide.with_ambient(record, self.readings),
             alpha_rad=alpha_rad,
             beta_rad=beta_rad,
@@ -214,13 +236,6 @@ class StageSweep(Guide):
             alpha_setting=alpha,
             beta_setting=beta,
         )
-        if refusal := _fault(self, record, dwell, rest):
-            self.refuse(refusal)
-        elif self.to_verify:
-            _verify_mounting(self, record)
-        else:
-            return record
-        return None
 
     def take(self, record: PoseRecord) -> None:
         """Count a pose that is on disk, and go on to the next open one."""
@@ -344,15 +359,15 @@ class StageGuide(StageSweep):
         target = self.course.target
         by_encoder = self.settings.stage_mode is StageMode.ENCODER
         if target is None:
-            return GuideStatus(Phase.DONE, 'all poses are taken', False)
+            return GuideStatus(Phase.DONE, 'all poses are taken')
         waited_s = (self.now_ns - (self.since_ns or 0)) * 1e-9
         if self.uses_encoder and (fault := self.encoder.clock_fault()):
-            return GuideStatus(Phase.STAGE, fault, True)
+            return GuideStatus(Phase.STAGE, fault, late=True)
         silence = self.encoder.silence(self.now_ns) if self.uses_encoder else ''
         if silence and (self.dwell is not None or by_encoder):
             return GuideStatus(Phase.STAGE, silence, waited_s > guide.SILENT_S)
         if self.refusal:
-            return GuideStatus(Phase.REFUSED, self.refusal, True)
+            return GuideStatus(Phase.REFUSED, self.refusal, late=True)
         late = waited_s > self.settings.timeout_s
         since = f' for {waited_s:.0f} s' if late else ''
         place = self.destination()
@@ -363,7 +378,7 @@ class StageGuide(StageSweep):
             motion = stillness.describe_mps2(self.sensor) if stillness else 'waiting for samples'
             return GuideStatus(Phase.REST, f'at {place}: {motion}{since}', late)
         if not self.moves_itself:
-            return GuideStatus(Phase.OPERATOR, f'turn the stage to {place}, then capture', False)
+            return GuideStatus(Phase.OPERATOR, f'turn the stage to {place}, then capture')
         distance = silence
         if not silence and self.encoder.angles_rad is not None:
             distance = pose_plan.angle_fault(

@@ -118,9 +118,9 @@ class ThermalGuide(Guide):
     def status(self) -> GuideStatus:
         """Return what the guide waits for, with the values that matter."""
         if self.refusal:
-            return GuideStatus(Phase.REFUSED, self.refusal, True)
+            return GuideStatus(Phase.REFUSED, self.refusal, late=True)
         if self._passed.complete:
-            return GuideStatus(Phase.DONE, self.destination(), False)
+            return GuideStatus(Phase.DONE, self.destination())
         at_rest = self._dwell is not None and self._dwell.at_rest()
         motion = '' if at_rest or self._dwell is None else 'the sensor moves; '
         coverage, error = self._expected()
@@ -128,7 +128,6 @@ class ThermalGuide(Guide):
             Phase.DWELL if at_rest else Phase.REST,
             f'{len(self.accepted)} blocks; '
             f'{coverage.text}; {error.text}; {motion}{self.destination()}',
-            False,
         )
 
     def progress(self) -> list[ScreenRow]:

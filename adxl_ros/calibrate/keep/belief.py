@@ -37,7 +37,8 @@ _DIRECTION_STD_G = 10.0
 the zero-g what this allows, and those of a year together still 0.15 g, far above any zero-g error.
 """
 _CREEP_G2_PER_DAY = (3e-4**2) * 24
-"""Growth of its variance within a stay, g²/day. Chosen: 0.3 mg in an hour, by tyres."""
+"""Growth of the variance of a direction within a stay, g²/day. Chosen: 0.3 mg in an hour, by
+tyres."""
 _LEAST_LOG_WEIGHT = -30.0
 """Least logarithm of a weight; chosen: a filter that was wrong can still come back."""
 _LEAST_LOG_SHARE = np.log(1e-3)

@@ -25,10 +25,10 @@ from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
-from adxl_ros.process import option
 from adxl_ros.report import templates
 from adxl_ros.report.quantities import mg, number
 from adxl_ros.signals.rest_means import MOST_BATCHES
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided.controller import Controller, ControllerState
+from adxl_ros.calibrate.guided.controller import Controller, ControllerState, StartMode
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.errors import UserError
@@ -188,7 +188,7 @@ def test_an_operator_at_a_screen_has_a_choice_and_others_resume(rig, tmp_path):
     assert asking.controller.status() == (
         type(asking.controller.status())(Phase.QUESTION, answer.message, True)
     )
-    assert asking.controller.start(start_over=False).success
+    assert asking.controller.start(StartMode.CONTINUE).success
     assert asking.controller.session.accepted_count == 3
     assert 'resumed after 3 poses (the last one first' in asking.lines()[-1]
     assert asking.controller.abort().success
@@ -222,7 +222,7 @@ def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeyp
     assert status.text == 'cannot finish: unit.yaml: the disk is full; finish again, redo or abort'
     bench.turn(0.5)
     assert bench.lines(Level.ERROR) == [status.text], 'one attempt has one report'
-    assert bench.controller.change_pose('redo') == (True, 'pose 10 will be taken again')
+    assert bench.controller.redo() == (True, 'pose 10 will be taken again')
     assert not bench.controller.fit_fault
     bench.turn_until(lambda: bench.controller.fit_fault)
     monkeypatch.undo()
@@ -246,7 +246,7 @@ def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
     bench.turn_until(lambda: bench.answers)
     assert bench.answers == [(True, 'pose 1 is on disk')]
     bench.controller.capture()
-    assert bench.controller.change_pose('skip') == (True, 'pose 2 is left out')
+    assert bench.controller.skip() == (True, 'pose 2 is left out')
     assert bench.answers[-1] == (False, 'pose 2 is left out')
     bench.fault = 'this stream is already compensated'
     bench.turn()
