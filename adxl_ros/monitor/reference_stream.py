@@ -143,7 +143,7 @@ class ReferenceStream:
         """Add messages of the stage; a joint that one does not name is where it was before."""
         rows = []
         for position in positions:
-            values = [position.get(joint, held) for joint, held in zip(JOINTS, self._held)]
+            values = list(map(position.get, JOINTS, self._held))
             self._held = values if np.isfinite(values).all() else self._held
             rows.append(values)
         self.add_readings(np.array(stamps_ns, np.int64), np.array(rows).reshape(-1, len(JOINTS)))

@@ -220,8 +220,7 @@ def quiet_variance(
     step²/4. Samples without any noise still have a rounding error.
     """
     smallest = step**2 / 4 + _rounding(blocks)
-    of_axes = [_quietest(variances, least) for variances, least in zip(windows.T, smallest)]
-    variance, ratio = np.array(of_axes).T
+    variance, ratio = np.transpose(list(map(_quietest, windows.T, smallest)))
     return variance, ratio * variance
 
 
