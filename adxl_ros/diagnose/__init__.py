@@ -9,6 +9,10 @@ the question and its stages
     diagnosis           one call from recordings to a report: the stages below, in order
 the recording beside its simulation
     comparison          the baseline on the recorded motion, and the samples that count
+    reference_gaps      gaps between the readings of a reference
+    fast_motion         motion that these readings do not show
+    detection           an effect that shows in samples or noise, with its parameters
+    sample_faults       samples that repeat, stand alone or are held, and coarse codes
     data_faults         what a fault of the data is
     data_checks         the checks in order: corrected, left out or refused
     stamp_checks        stamps that are late or impossible
@@ -32,7 +36,8 @@ the decision
     verdict             what is said, and how surely
     verdict_sensor      the sensor with the effects of the verdict
     ideal_observer      how surely anybody could have said it
-    noise_effects       effects that show in the noise alone
+    noise_effects       a line and excess noise
+    noise_remainders    the noise of a recording beside that of its simulation
 what a reader is told besides
     gap_closure         the gap before and after
     gap_in_unit         the gap as an angle, a velocity or a function
