@@ -45,7 +45,7 @@ def turning(speeds=(0.6, 1.5, 1.0, 2.5, 0.8), alphas=(np.pi / 2, np.pi / 4, 2.0)
             script.run('beta', to, speed)
             script.rest(1.0)
     alpha, beta = script.joints()
-    return Motion(script.now, alpha, beta)
+    return Motion(script.now_s, alpha, beta)
 
 
 def warm(motion):
