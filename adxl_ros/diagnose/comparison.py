@@ -71,11 +71,6 @@ class LeftOut:
         """Sum of their squares, mean over axes, (m/s²)²."""
         return float(np.nan_to_num(self.samples * self.rms_mps2**2))
 
-    @property
-    def why(self) -> str:
-        """Return the reason without its figures."""
-        return self.reason.partition(' (')[0]
-
 
 class Reference(Enum):
     """What determines the motion of a recording; without any the sensor never moves."""
@@ -356,12 +351,17 @@ def time_since_move_s(time_s: np.ndarray, rates: Sequence[np.ndarray]) -> np.nda
 
 
 def leave_out(
-    comparison: BaselineComparison, rows: np.ndarray, reason: str, effect: str | None = None
+    comparison: BaselineComparison,
+    rows: np.ndarray,
+    reason: str,
+    effect: str | None = None,
+    details: str = '',
 ) -> BaselineComparison:
     """
     Return a comparison that does not use some samples, and notes why, when and how many.
 
-    Samples that are left out for another reason already keep that one.
+    Samples that are left out for another reason already keep that one. `details` follow the reason
+    in the note alone.
     """
     rows = rows & comparison.used
     if not rows.any():
@@ -380,7 +380,8 @@ def leave_out(
     parts = ', '.join(_span_text(time_s[a], time_s[b - 1]) for a, b in runs[:_NAMED_PARTS])
     if len(runs) > _NAMED_PARTS:
         parts += ', ...'
-    note = f'left out: {left_out.samples} samples, {left_out.duration_s:.3g} s ({parts}): {reason}'
+    size = f'{left_out.samples} samples, {left_out.duration_s:.3g} s'
+    note = f'left out: {size} ({parts}): {reason}{details}'
     if len(squares):
         note += f'; they differ by {acceleration_text(left_out.rms_mps2)} rms'
     return replace(

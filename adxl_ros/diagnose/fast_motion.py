@@ -80,23 +80,24 @@ def without_fast_motion(
             continue
         rows = near(_with_aliases(comparison, coarse, noise_g)) & ~rests
         lacks = near(readings.lacks(comparison.time_s))
-        error = f'(error up to {1e3 * error_g[rows].max():.2g} mg)'
+        error = f' (error up to {1e3 * error_g[rows].max():.2g} mg)'
         rate_hz = stamped_rate_hz(readings.time_s)
-        reasons = [
-            (
-                beyond,
-                f'the output is beyond the range of {sensor.range_g:g} g that the parameter file '
-                f'states, in motion that {readings.name} does not follow {error}',
-            ),
-            (lacks, f'{readings.name} lacks readings there {error}'),
-            (
-                rows,
-                f'{readings.name} moves too fast for its {rate_hz:.4g} readings a second {error}; '
-                'read it at a higher rate',
-            ),
-        ]
-        for explained, reason in reasons:
-            comparison = leave_out(comparison, rows & explained, reason)
+        comparison = leave_out(
+            comparison,
+            rows & beyond,
+            f'the output is beyond the range of {sensor.range_g:g} g that the parameter file '
+            f'states, in motion that {readings.name} does not follow',
+            details=error,
+        )
+        comparison = leave_out(
+            comparison, rows & lacks, f'{readings.name} lacks readings there', details=error
+        )
+        comparison = leave_out(
+            comparison,
+            rows,
+            f'{readings.name} moves too fast for its {rate_hz:.4g} readings a second',
+            details=f'{error}; read it at a higher rate',
+        )
     return comparison
 
 
@@ -112,8 +113,9 @@ def _without_jerks(
     return leave_out(
         comparison,
         np.convolve(rows, np.ones(2 * margin + 1), 'same') > 0.5,
-        f'the robot jerks, which its encoders do not show (error up to {1e3 * error_g.max():.2g} '
-        'mg); move more smoothly, or record the joints at a higher rate',
+        'the robot jerks, which its encoders do not show',
+        details=f' (error up to {1e3 * error_g.max():.2g} mg); move more smoothly, or record the '
+        'joints at a higher rate',
     )
 
 

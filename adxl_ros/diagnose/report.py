@@ -182,7 +182,7 @@ def _left_out_text(report: Report) -> str:
     """Say which samples a verdict is not about, where they would matter; empty for none."""
     size = quantities.acceleration_text
     texts = [
-        f'{part.samples} samples ({size(part.rms_mps2)} rms), {part.why}'
+        f'{part.samples} samples ({size(part.rms_mps2)} rms), {part.reason}'
         for part in report.left_out
     ]
     return f' Not compared: {"; ".join(texts)}.' if texts else ''

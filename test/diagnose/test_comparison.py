@@ -63,7 +63,7 @@ def test_what_is_left_out_is_counted_with_its_size(compared):
     rows[100:150] = True
     kept = beside.leave_out(compared, rows, 'they were shaken', 'spikes')
     (part,) = kept.left_out
-    assert (part.samples, part.effect, part.why) == (50, 'spikes', 'they were shaken')
+    assert (part.samples, part.effect, part.reason) == (50, 'spikes', 'they were shaken')
     assert part.duration_s == pytest.approx(50 * compared.dt_s)
     assert part.rms_mps2 == pytest.approx(GAP_MPS2)
     assert part.squares_mps2 == pytest.approx(50 * GAP_MPS2**2)
