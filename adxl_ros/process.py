@@ -2,20 +2,18 @@
 
 """What the processes of all executables share; it must load before numpy, and quickly."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from functools import lru_cache
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
 import os
 from pathlib import Path
-import re
 import select
-import shlex
 import signal
 import sys
-from typing import Any
+
+from adxl_ros.wording import option as option, usage as usage
 
 NODES = (
     'driver',
@@ -31,32 +29,6 @@ NODES = (
 STARTED_BY = 'ADXL_ROS_COMMAND'
 """Environment variable with the words before the name of a tool, as its user wrote them."""
 ONE_COMMAND = 'adxl_ros'  # The command of a package that pip has installed
-NAMES_OPTIONS = 'ADXL_ROS_NAMES_OPTIONS'
-"""Environment variable of tools and nodes, and of their workers: texts name options of tools."""
-_OPTIONS = {
-    'certificate': 'dcc',
-    'effects': 'effect',
-    'quantity': 'in',
-    'sensor': 'params',
-}
-"""Options of tools that are not called as the argument of a verb, by that argument."""
-_UNQUOTED = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?|[A-Z]{2,}')
-"""What has no quotes in Python: numbers, and words in capitals, which stand for values."""
-_METHODS = ('certificate', 'report')  # Options of `fit` that are methods of its result in Python
-READING = (
-    'topic',
-    'columns',
-    'unit',
-    'lsb_per_g',
-    'lsb_at_0g',
-    'rate',
-    'axes',
-    'drop_bad_stamps',
-    'drop_bad_samples',
-)
-"""Arguments of `read`, which are options of the tools that read recordings."""
-_READER = ContextVar('reader', default='read or from_arrays')
-"""What reads recordings, as texts in Python call it."""
 
 
 def release_version() -> str:
@@ -97,85 +69,6 @@ def command(tool: str, arguments: str = '') -> str:
     """Return the command line that runs a tool in the way in which this process was started."""
     usual = 'ros2 run adxl_ros' if 'AMENT_PREFIX_PATH' in os.environ else 'adxl_ros'
     return f'{os.environ.get(STARTED_BY, usual)} {tool} {arguments}'.rstrip()
-
-
-@contextmanager
-def read_by(verb: str) -> Iterator[None]:
-    """Let texts name the verb that reads a recording; others do not know it."""
-    token = _READER.set(verb)
-    try:
-        yield
-    finally:
-        _READER.reset(token)
-
-
-@contextmanager
-def options_named() -> Iterator[None]:
-    """Let texts name options of tools, because a tool or a node is running."""
-    before = os.environ.get(NAMES_OPTIONS)
-    os.environ[NAMES_OPTIONS] = '1'
-    try:
-        yield
-    finally:
-        del os.environ[NAMES_OPTIONS]
-        if before:
-            os.environ[NAMES_OPTIONS] = before
-
-
-def names_options() -> bool:
-    """Return whether a tool or a node is running, and no program in Python."""
-    return NAMES_OPTIONS in os.environ
-
-
-def option(*names: str, **values: Any) -> str:
-    """
-    Return how a text names what its reader may give: `--unit g` to a tool, `unit='g'` to a verb.
-
-    names: what is named without a value; values: True for a switch, a list for an option that may
-    be repeated. Both have the names of the arguments in Python.
-    """
-    given = {**dict.fromkeys(names), **values}
-    if names_options():
-        return ' '.join(_of_tool(name, value) for name, value in given.items())
-    arguments = _arguments(given)
-    # Other verbs take recordings as they were read.
-    return f'{_READER.get()}(..., {arguments})' if given.keys() <= {*READING} else arguments
-
-
-def usage(verb: str, *inputs: str, **values: Any) -> str:
-    """Return how a verb is used with an option: `fit --means` as a tool, `fit(means=True)`."""
-    if names_options():
-        return ' '.join((verb, *inputs, option(**values)))
-    return f'{verb}({", ".join((*map(repr, inputs), _arguments(values)))})'
-
-
-def pasted(columns: str, **values: Any) -> str:
-    """Return options with a mapping of columns, which a shell or Python reads as they are."""
-    if names_options():
-        quoted = shlex.quote(columns)
-        columns = quoted if quoted != columns else f"'{columns}'"
-    return option(columns=columns, **values)
-
-
-def _of_tool(name: str, value: Any) -> str:
-    """Return an option of a tool."""
-    flag = f'--{_OPTIONS.get(name, name).replace("_", "-")}'
-    if isinstance(value, list):
-        return ' '.join(f'{flag} {each}' for each in value)
-    return flag if value is None or value is True else f'{flag} {value}'
-
-
-def _arguments(given: Mapping[str, Any]) -> str:
-    """Return arguments of a verb."""
-    return ', '.join(_of_verb(name, value) for name, value in given.items())
-
-
-def _of_verb(name: str, value: Any) -> str:
-    """Return an argument of a verb, or a method of its result."""
-    text = '' if value is None else repr(value)
-    if _UNQUOTED.fullmatch(str(value)):
-        text = str(value)
-    return f'{name}({text})' if name in _METHODS else f'{name}={text}'
 
 
 def use_one_thread() -> None:

@@ -277,8 +277,8 @@ def poses_at(
     for pose in true:
         script.go(*pose)
         script.rest(SETTLED_S + trajectories.DWELL_S)
-        ends_s.append(script.now)
-    columns = simulate(truth, Motion(script.now, *script.joints()), seed)
+        ends_s.append(script.now_s)
+    columns = simulate(truth, Motion(script.now_s, *script.joints()), seed)
     time_s = columns.pop('time_s')
     recording = Recording('simulated', time_s, columns, sensor_info(truth))
     samples = round(trajectories.DWELL_S * truth.rate_hz)

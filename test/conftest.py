@@ -19,7 +19,7 @@ import signal
 import subprocess
 import sys
 
-from adxl_ros.process import NAMES_OPTIONS
+from adxl_ros.wording import NAMES_OPTIONS
 from domain import BY_UDP, own_domain
 from hypothesis import settings
 import needs

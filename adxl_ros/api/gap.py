@@ -32,7 +32,7 @@ from adxl_ros.diagnose.could_show import CouldShow
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantity_named
 from adxl_ros.diagnose.ideal_observer import Surest
-from adxl_ros.diagnose.report_json import as_json as diagnosis_json, named_effects
+from adxl_ros.diagnose.report_json import as_json as diagnosis_json, candidates, named_effects
 from adxl_ros.diagnose.screen import screen_lines
 from adxl_ros.diagnose.self_check import diagnose_again
 from adxl_ros.diagnose.verdict import MATERIAL_MG
@@ -470,13 +470,17 @@ def _gap(
     remarks: Sequence[str],
 ) -> Gap:
     """Collect what a user reads of a diagnosis."""
-    objects = diagnosis_json(diagnosis)
     report = diagnosis.report
+    fault = diagnosis.fault
+    verdict = fault.status if fault else ''
+    probability = 1.0
     effects: tuple[FoundEffect, ...] = ()
     figures = None
     if report is not None:
-        candidates = {c['effect']: c for c in objects['candidates']}
-        effects = tuple(_effect(candidates[name]) for name in named_effects(report, objects))
+        verdict = report.verdict.status
+        probability = report.verdict.probability
+        found = {c['effect']: c for c in candidates(report)}
+        effects = tuple(_effect(found[name]) for name in named_effects(report))
         before, after, floor, closed = report.closure
         figures = GapFigures(
             before_mps2=before,
@@ -488,16 +492,16 @@ def _gap(
             reference_mps2=report.verdict.reference_mps2,
         )
     return Gap(
-        verdict=objects['verdict']['status'],
-        probability=objects['verdict']['probability'],
+        verdict=verdict,
+        probability=probability,
         surest=report.surest if report else None,
         effects=effects,
         figures=figures,
         could_show=report.could_show if report else (),
         sensor=report.sensor if report else baseline,
-        fault=diagnosis.fault.message if diagnosis.fault else '',
-        summary=objects['summary'],
-        notes=tuple(objects['notes']),
+        fault=fault.message if fault else '',
+        summary=words.summary(diagnosis),
+        notes=tuple(words.notes(diagnosis)),
         in_unit=in_unit,
         remarks=tuple(remarks),
         compared=compared,
@@ -506,7 +510,7 @@ def _gap(
 
 
 def _effect(candidate: Mapping[str, Any]) -> FoundEffect:
-    """Return an effect as report.json has it."""
+    """Return an effect of the report, unrounded."""
     parameters = {}
     for name, parameter in candidate['parameters'].items():
         low, high = parameter.get('ci') or (None, None)

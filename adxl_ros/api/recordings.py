@@ -26,7 +26,7 @@ from adxl_ros.files.column_mapping import (
 from adxl_ros.files.recording_columns import ACCEL, GYRO, Recording, REFERENCES, TIME, VOLTS
 from adxl_ros.files.tables import in_memory
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option, read_by
+from adxl_ros.wording import option
 import numpy as np
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ _OBJECTS = 'O'  # Kind of arrays of any objects
 _HIGHEST_RATE_HZ = 1e5  # Largest sample rate, Hz: that of a parameter file
 
 
-@read_by('read')
 def read(
     source: RecordingInput,
     *,
@@ -177,7 +176,6 @@ def _counts(argument: str, stated: Counts, above: float) -> tuple[float, ...]:
     )
 
 
-@read_by('from_arrays')
 def from_arrays(
     table: Mapping[str, Any] | DataFrame | None = None,
     /,

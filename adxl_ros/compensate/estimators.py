@@ -27,7 +27,7 @@ from adxl_ros.model.effects.base import (
 )
 from adxl_ros.model.kinematics import AngleEstimate, angles, Covariance3, Mounting, Tilt, tilt
 from adxl_ros.model.sensor import parameter_of, Sensor
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 
 _CELL_MPS2 = 0.5

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from adxl_ros.diagnose.comparison import BaselineComparison, code_step_v
+from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.motion_shifts import CORRELATED
-from adxl_ros.diagnose.noise_effects import SMALLEST_RANGE_V
 from adxl_ros.diagnose.reference_checks import check_delay, LARGEST_DELAY_S
+from adxl_ros.diagnose.sample_faults import code_step_v, SMALLEST_RANGE_V
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.sensor import to_nominal_mps2

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from adxl_ros.diagnose import linear_model as linear, noise_effects
+from adxl_ros.diagnose import linear_model as linear, noise_effects, sample_faults
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.evidence import left_beside
 from adxl_ros.diagnose.linear_model import LinearModel
@@ -130,13 +130,13 @@ def _noise_could_show(
         Detector.MAINS_LINE: ('amplitude_v', line_v),
         Detector.ISOLATED_SAMPLES: (
             'amplitude_v',
-            noise_effects.SPIKE_STDS * max(level_v, noise.electronics(sensor).lsb_v.max()),
+            sample_faults.SPIKE_STDS * max(level_v, noise.electronics(sensor).lsb_v.max()),
         ),
         Detector.REPEATED_SAMPLES: (
             'duration_s',
-            noise_effects.shortest_repeat(comparison.volts, len(sensor.axes)) / rate_hz,
+            sample_faults.shortest_repeat(comparison.volts, len(sensor.axes)) / rate_hz,
         ),
-        Detector.COARSE_CODES: ('lost_bits', float(np.log2(noise_effects.COARSE_STEPS))),
+        Detector.COARSE_CODES: ('lost_bits', float(np.log2(sample_faults.COARSE_STEPS))),
     }
     rows = []
     for effect in library().values():

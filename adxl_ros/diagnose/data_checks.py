@@ -14,13 +14,16 @@ from dataclasses import replace
 from os.path import basename
 from typing import NamedTuple
 
-from adxl_ros.diagnose import comparison as baseline, noise_effects
 from adxl_ros.diagnose.axis_checks import check_axes, check_output, stuck
-from adxl_ros.diagnose.comparison import BaselineComparison
+from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison, leave_out
 from adxl_ros.diagnose.data_faults import DataFault
-from adxl_ros.diagnose.encoder_checks import check_encoder
+from adxl_ros.diagnose.detection import effect_of
+from adxl_ros.diagnose.encoder_checks import check_encoder, seen_step_rad
+from adxl_ros.diagnose.fast_motion import fading_frequency_hz, without_fast_motion
 from adxl_ros.diagnose.motion_shifts import SHORTEST_S
 from adxl_ros.diagnose.reference_checks import check_rest, check_simulator, check_stated_gravity
+from adxl_ros.diagnose.reference_gaps import stated_poses, without_gaps
+from adxl_ros.diagnose.sample_faults import sample_faults, SampleFaults
 from adxl_ros.diagnose.simulator_time import covered_by
 from adxl_ros.diagnose.stamp_checks import (
     check_clock,
@@ -76,7 +79,7 @@ def compare_checked(
         notes += of_shift
     else:
         check_encoder(recording, sensor)
-        step_rad = baseline.seen_step_rad(recording, sensor)
+        step_rad = seen_step_rad(recording, sensor)
         if step_rad > sensor.stage_resolution_rad:
             stated_deg = np.degrees(sensor.stage_resolution_rad)
             notes.append(
@@ -84,7 +87,7 @@ def compare_checked(
                 f'{stated_deg:.3g}° as stated: this is used'
             )
             sensor = replace(sensor, stage_resolution_rad=step_rad)
-        recording, unknown_poses = baseline.stated_poses(recording, sensor)
+        recording, unknown_poses = stated_poses(recording, sensor)
     comparison = compare_by_best_stamps(recording, sensor, sim, even_s)
     comparison = replace(comparison, notes=(*notes, *comparison.notes))
     try:
@@ -93,16 +96,16 @@ def compare_checked(
     except DataFault as fault:
         raise replace(fault, comparisons=(comparison,)) from None
     for rows, reason in unknown_poses if comparison.joints else ():
-        comparison = baseline.leave_out(comparison, rows, reason)
-    comparison = baseline.without_gaps(_without_disturbed(comparison))
+        comparison = leave_out(comparison, rows, reason)
+    comparison = without_gaps(_without_disturbed(comparison))
     # What moves too fast is looked for where the reference is stated.
-    comparison = baseline.without_fast_motion(comparison, recording.columns)
+    comparison = without_fast_motion(comparison, recording.columns)
     return _with_fading(comparison)
 
 
 def _with_fading(comparison: BaselineComparison) -> BaselineComparison:
     """Find the frequency above which a reference is smoother than the sensor, and say so first."""
-    fading_hz = baseline.fading_frequency_hz(comparison)
+    fading_hz = fading_frequency_hz(comparison)
     if fading_hz is None:
         return comparison
     note = (
@@ -115,14 +118,14 @@ def _with_fading(comparison: BaselineComparison) -> BaselineComparison:
 
 def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     """Leave out what the sensor did not measure: no numbers, repeated, lone or stuck samples."""
-    faults = noise_effects.sample_faults(comparison)
+    faults = sample_faults(comparison)
     sensor = comparison.sensor
     is_stuck = stuck(comparison)
     readings_mps2 = to_nominal_mps2(comparison.volts, sensor)
     disturbed = faults.repeated | faults.isolated | is_stuck.any(axis=1)
     comparison = replace(comparison, disturbed=disturbed)
     no_number = ~np.isfinite(comparison.volts).all(axis=1)
-    comparison = baseline.leave_out(comparison, no_number, 'they are no numbers')
+    comparison = leave_out(comparison, no_number, 'they are no numbers')
     comparison = _leave_out(
         comparison, faults.repeated, 'they repeat the one before', Detector.REPEATED_SAMPLES
     )
@@ -133,7 +136,7 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
         Detector.ISOLATED_SAMPLES,
     )
     for d, axis in enumerate(sensor.axes):
-        comparison = baseline.leave_out(
+        comparison = leave_out(
             comparison,
             is_stuck[:, d],
             f'{axis} does not change there, though the motion does',
@@ -154,8 +157,8 @@ def _leave_out(
     comparison: BaselineComparison, rows: np.ndarray, reason: str, detector: Detector
 ) -> BaselineComparison:
     """Leave out samples that show the effect of a detector."""
-    effect = noise_effects.effect_of(detector)
-    return baseline.leave_out(comparison, rows, reason, effect)
+    effect = effect_of(detector)
+    return leave_out(comparison, rows, reason, effect)
 
 
 def _notes_on_range(comparison: BaselineComparison) -> list[str]:
@@ -180,7 +183,7 @@ class CheckedRecording(NamedTuple):
 
     comparison: BaselineComparison  # The recording beside the baseline at its full rate
     search_comparison: BaselineComparison  # The same at the rate of the search
-    faults: noise_effects.SampleFaults  # What the samples themselves show
+    faults: SampleFaults  # What the samples themselves show
     stated: Sensor  # The baseline with the steps of the ADC by the parameter file
 
 
@@ -190,10 +193,10 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
 
     Where codes of the ADC are coarser than stated, the baseline gets their steps, axis by axis.
     """
-    faults = noise_effects.sample_faults(comparison)
+    faults = sample_faults(comparison)
     stated = comparison.sensor
     comparison = replace(comparison, sensor=faults.sensor)
-    search_comparison = baseline.at_search_rate(comparison)
+    search_comparison = at_search_rate(comparison)
     if comparison.pose_known:
         check_axes(search_comparison)
     else:

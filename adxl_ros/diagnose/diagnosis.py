@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
-from adxl_ros.diagnose import data_checks, noise_effects, verdict as rule
+from adxl_ros.diagnose import data_checks, verdict as rule
 from adxl_ros.diagnose.comparison import BaselineComparison, LeftOut, Reference
 from adxl_ros.diagnose.could_show import could_show, CouldShow
 from adxl_ros.diagnose.data_checks import CheckedRecording
 from adxl_ros.diagnose.data_faults import DataFault
+from adxl_ros.diagnose.detection import Detection
 from adxl_ros.diagnose.evidence import BLOCKS, sum_by_block
 from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.gap_closure import gap_closure, GapClosure
@@ -29,11 +30,18 @@ from adxl_ros.diagnose.linear_model import (
     with_filters,
 )
 from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
-from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
+from adxl_ros.diagnose.noise_effects import residual_detections
 from adxl_ros.diagnose.noise_filters import drifts_among
 from adxl_ros.diagnose.noise_floor import estimate_floor, NoiseFloor
+from adxl_ros.diagnose.noise_remainders import (
+    compare_noise,
+    noise_remainders,
+    NoiseRemainder,
+    NoiseSensors,
+)
 from adxl_ros.diagnose.remainder import Remainder, reproducible_remainder
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
+from adxl_ros.diagnose.sample_faults import residual_shows_spikes
 from adxl_ros.diagnose.search import Hypothesis, Search
 from adxl_ros.diagnose.verdict import MATERIAL_MG, Verdict
 from adxl_ros.diagnose.verdict_sensor import as_printed, named_sensor, with_likely_drift
@@ -213,7 +221,7 @@ def _evidence(search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int
         counts=counts,
         weights=rule.block_weights(seed),
         material_mps2=smallest_mps2,
-        reference_mps2=max(model.smallest_angle_rad() * G0_MPS2, robot_mps2),
+        reference_mps2=float(max(model.smallest_angle_rad() * G0_MPS2, robot_mps2)),
         errs_in_motion=robot_mps2 > 0,
         fades=any(c.fading_hz is not None for c in comparisons),
         wanders=any(getattr(c.motion.force, 'wanders', False) for c in comparisons),
@@ -331,11 +339,11 @@ def _detections(
         spikes = [
             d
             for d in c.faults.possible_spikes
-            if noise_effects.residual_shows_spikes(d, residual_v, regular, comparison.sensor)
+            if residual_shows_spikes(d, residual_v, regular, comparison.sensor)
         ]
-        found = noise_effects.residual_detections(comparison, residual_v, best)
+        found = residual_detections(comparison, residual_v, best)
         if found:
-            of_baseline = noise_effects.residual_detections(comparison, residual_v, baseline)
+            of_baseline = residual_detections(comparison, residual_v, baseline)
             usual = {d.effect for d in of_baseline}
             found = [d for d in found if d.effect in usual]
         detections += [*c.faults.detections, *spikes, *found]
@@ -362,11 +370,10 @@ def _report(
     pose_known = any(c.pose_known for c in comparisons)
     sensor = named_sensor(verdict, best, detections, baseline, fits, pose_known)
     lacking = tuple(not_covered(model.comparisons))
-    remainders = tuple(
-        noise_effects.noise_remainders(comparisons, best.sensor, sensor, detections, seed)
-    )
+    remainders = tuple(noise_remainders(comparisons, best.sensor, sensor, detections, seed))
     ranked = sorted(search.found.values(), key=lambda h: -h.log_evidence)
-    sensors = {'before': (baseline, baseline), 'after': (best.sensor, sensor)}
+    before = NoiseSensors(baseline, baseline)
+    after = NoiseSensors(best.sensor, sensor)
     left_out = chain(*(c.left_out for c in comparisons))
     removed = sum(part.squares_mps2 for part in left_out if part.effect is not None)
     removed_power = removed / sum(len(c) for c in comparisons)
@@ -377,7 +384,7 @@ def _report(
         hypotheses=(best, *(h for h in ranked if h is not best)),
         detections=tuple(detections),
         noise_remainders=remainders,
-        noise=tuple(compare_noise(c, sensors, seed) for c in comparisons),
+        noise=tuple(compare_noise(c, before, after, seed) for c in comparisons),
         residual_cells=tuple(residual_map(model.comparisons[0], seed)),
         not_covered=lacking,
         could_show=tuple(could_show(model, comparisons[0], floor.noise_v, verdict.material_mps2)),

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from itertools import pairwise, repeat
 from typing import NamedTuple
 
-from adxl_ros.diagnose.comparison import bridged
 from adxl_ros.diagnose.noise_filters import drifts_among, Whitener, without_pole
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Role
 from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.signals.block_statistics import bridged
 import numpy as np
 import scipy
 

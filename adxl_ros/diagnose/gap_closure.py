@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from adxl_ros.diagnose.noise_effects import floor_without, NoiseRemainder
 from adxl_ros.diagnose.noise_floor import NoiseFloor
+from adxl_ros.diagnose.noise_remainders import floor_without, NoiseRemainder
 from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.diagnose.weighing import Evidence, HEALTHY
 from adxl_ros.model import noise

@@ -21,7 +21,7 @@ from itertools import chain, product
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
-from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
+from adxl_ros.diagnose.comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis
 from adxl_ros.diagnose.noise_filters import drifts_among, Whitener, whiteners
 from adxl_ros.errors import UserError
@@ -29,7 +29,14 @@ from adxl_ros.model import noise
 from adxl_ros.model.effects import base, effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Parameter, Role
 from adxl_ros.model.error_sizes import rms
-from adxl_ros.model.sensor import names_of, parameter_of, put, Sensor, with_neutral
+from adxl_ros.model.sensor import (
+    names_of,
+    parameter_of,
+    put,
+    Sensor,
+    with_neutral,
+    with_values,
+)
 import numpy as np
 
 PRIOR_WIDTH = 5.0

@@ -19,12 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import suppress
+from functools import cache
 from itertools import chain, combinations, count
 from pathlib import Path
 from typing import NamedTuple
 
 from adxl_ros.diagnose import comparison as beside, linear_model as linear
-from adxl_ros.diagnose.comparison import Reference, with_values
+from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.evidence import LinearFit
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
@@ -32,7 +33,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern, Manoeuvre
-from adxl_ros.model.sensor import Sensor, with_neutral
+from adxl_ros.model.sensor import Sensor, with_neutral, with_values
 from adxl_ros.process import command
 from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
@@ -96,7 +97,7 @@ def expected_information(
 class ManoeuvreWorth(NamedTuple):
     """What a manoeuvre is expected to tell."""
 
-    name: str
+    name: str  # Name of a `Manoeuvre`, or one that the investigation plans
     minutes: float  # Duration, min
     information: float  # Expected decrease of the entropy of the hypotheses, nat
 
@@ -165,7 +166,7 @@ class _SoFar(NamedTuple):
             return model.fit_variants([variant], model.null_fit).log_evidence
 
         best: dict[str, int] = {}
-        for effect in set(chain(*(h.effects for h in hypotheses))):
+        for effect in set(chain.from_iterable(h.effects for h in hypotheses)):
             numbers = _variants_of(model, effect)
             if numbers:
                 best[effect] = max(numbers, key=log_evidence)
@@ -222,7 +223,7 @@ def _belief(
     chosen = [
         numbers[len(numbers) // 2] for effect in unseen if (numbers := _variants_of(model, effect))
     ]
-    known = [*model.nuisance_ids, *chain(*(model.column_ids[i] for i in chosen))]
+    known = [*model.nuisance_ids, *chain.from_iterable(model.column_ids[i] for i in chosen)]
     mean = np.zeros(len(model.names))
     variance = np.zeros(len(model.names))
     variance[known] = model.prior(chosen)[known] ** 2
@@ -300,22 +301,25 @@ def propose_next_experiment(
         )
     references = {c.reference for c in comparisons}
     beside_simulator = references == {Reference.SIMULATOR}
-    if verdict.groups:
-        ranked = _ranked_menu(verdict, sensor, model, seed)
-        best = next(m for m, described in MENU.items() if described.text == ranked[0].name)
-        why = f'to separate {listed(verdict.groups[0], "and")}'
-        return _experiment(best, why, beside_simulator, stem)._replace(menu=ranked)
     if verdict.status == 'no_gap' and not not_covered:
         return None
+    ranked: tuple[ManoeuvreWorth, ...] = ()
     usual = Manoeuvre.SPEEDS
     why = 'to confirm the verdict on another recording'
-    if verdict.status == 'unknown':
+    if verdict.groups:
+        ranked = _ranked_menu(verdict, sensor, model, seed)
+        why = f'to separate {listed(verdict.groups[0], "and")}'
+    elif verdict.status == 'unknown':
         why = 'to show what the unknown part of the gap depends on'
     elif not_covered:
         usual = Manoeuvre.PLANES
         why = f'because the recordings have no {", no ".join(not_covered)}'
-    revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
-    return _experiment(next(filter(None, revealed_by), usual), why, beside_simulator, stem)
+    if ranked:
+        manoeuvre = Manoeuvre[ranked[0].name]
+    else:
+        revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.named]
+        manoeuvre = next(filter(None, revealed_by), usual)
+    return _experiment(manoeuvre, why, beside_simulator, stem)._replace(menu=ranked)
 
 
 def _free_stem(recordings: Sequence[str]) -> str:
@@ -328,15 +332,22 @@ def _free_stem(recordings: Sequence[str]) -> str:
 def _ranked_menu(
     verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int
 ) -> tuple[ManoeuvreWorth, ...]:
-    """Rank the whole menu by its expected information."""
-    effects = sorted({*chain(*(h.effects for h in leading(verdict.hypotheses)))})
+    """Rank the menu by its expected information, without what the baseline cannot follow."""
+    of_leading = (h.effects for h in leading(verdict.hypotheses))
+    effects = sorted({*chain.from_iterable(of_leading)})
+
+    @cache
+    def predicted(trajectory: str, remounted: bool) -> PredictedResponse:
+        motion = trajectories.TRAJECTORIES[trajectory](np.random.default_rng(seed))
+        mounted = _remounted(sensor) if remounted else sensor
+        return predict(trajectory, motion, 0.0, mounted, effects)
+
     responses = []
-    for described in MENU.values():
-        motion = trajectories.TRAJECTORIES[described.trajectory](np.random.default_rng(seed))
-        mounted = _remounted(sensor) if described.remounted else sensor
-        # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
+    for manoeuvre, described in MENU.items():
+        # No trajectory moves a robot, and a soak has no pose for effects of the stage.
         with suppress(UserError):
-            responses.append(predict(described.text, motion, 0.0, mounted, effects))
+            response = predicted(described.trajectory, described.remounted)
+            responses.append(response._replace(name=manoeuvre.name))
     return rank_responses(responses, verdict.hypotheses, model)
 
 
@@ -345,8 +356,9 @@ def _experiment(
 ) -> NextExperiment:
     """Describe a manoeuvre with its command."""
     described = MENU[manoeuvre]
-    line = _beside_other_reference(stem)
-    if not beside_simulator:
+    if beside_simulator:
+        line = _beside_other_reference(stem)
+    else:
         turned = f' --effect {":".join(_half_turn())}={np.pi:.6f}' if described.remounted else ''
         line = command('simulate', f'{described.trajectory}{turned} -o {stem}.csv')
     return NextExperiment(described.text, why, line, beside_simulator=beside_simulator, stem=stem)

@@ -94,7 +94,7 @@ def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: s
 def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
     candidates = {c['effect']: c for c in objects['candidates']}
-    named = named_effects(report, objects)
+    named = named_effects(report)
     probable = [name for name, c in candidates.items() if c['probability'] >= words.PROBABLE]
     # The named effects come first, then those that are probable.
     shown = list(dict.fromkeys([*named, *probable]))

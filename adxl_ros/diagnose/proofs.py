@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TYPE_CHECKING
 
-from adxl_ros.diagnose.comparison import BaselineComparison, bridged
+from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.residual_map import BLOCK_S
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, Z_90
@@ -23,6 +23,7 @@ from adxl_ros.model.sensor import Sensor, with_neutral
 from adxl_ros.report import figures as plots
 from adxl_ros.report.figures import Figure, figure, line
 from adxl_ros.report.quantities import mg
+from adxl_ros.signals.block_statistics import bridged
 import numpy as np
 import scipy
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, TYPE_CHECKING
 
-from adxl_ros.diagnose.comparison import bridged
-from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.signals.block_statistics import bridged, true_runs
 import numpy as np
 import scipy
 

@@ -10,7 +10,7 @@ the right k does so, where the recording has dynamics at all.
 
 from __future__ import annotations
 
-from adxl_ros.diagnose.comparison import BaselineComparison, bridged
+from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.motion_shifts import correlate, CORRELATED
 from adxl_ros.files.recording_columns import stamped_rate_hz
@@ -20,6 +20,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg_text
 from adxl_ros.signals import gravity_at_rest, tolerances
+from adxl_ros.signals.block_statistics import bridged
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.signals.rest_means import rest_means

@@ -7,9 +7,10 @@ import json
 from typing import Any, TYPE_CHECKING
 
 from adxl_ros.diagnose import report as words
+from adxl_ros.diagnose.next_experiment import MENU
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient, Effect
+from adxl_ros.model.effects.base import Coefficient, Effect, Manoeuvre
 from adxl_ros.model.sensor import fitted_of, get, parameter_of
 from adxl_ros.report.quantities import Interval
 import numpy as np
@@ -71,7 +72,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 }
                 for r in report.could_show
             ],
-            'candidates': _candidates(report),
+            'candidates': candidates(report),
             'noise_remainders': [
                 {
                     'effect': r.effect,
@@ -118,7 +119,11 @@ def _of_fault(diagnosis: Diagnosis) -> dict[str, Any]:
 def _proposal(proposal: NextExperiment) -> dict[str, Any]:
     """Return what to record next, with the worth of all manoeuvres."""
     menu = [
-        {'manoeuvre': w.name, 'minutes': w.minutes, 'nats_per_minute': w.per_minute}
+        {
+            'manoeuvre': MENU[Manoeuvre[w.name]].text,
+            'minutes': w.minutes,
+            'nats_per_minute': w.per_minute,
+        }
         for w in proposal.menu
     ]
     return {
@@ -172,8 +177,8 @@ def _gap(report: Report) -> dict[str, Any]:
     }
 
 
-def _candidates(report: Report) -> list[dict[str, Any]]:
-    """Return the effects of all hypotheses and detections, the most probable first."""
+def candidates(report: Report) -> list[dict[str, Any]]:
+    """Return the effects of all hypotheses and detections, the most probable first, unrounded."""
     verdict = report.verdict
     visible = {row.name.effect: row.share for row in report.could_show}
     shares = words.shares_of_gap(report)
@@ -183,6 +188,7 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
         hypothesis = next((h for h in report.hypotheses if name in h.effects), None)
         if not probabilities and hypothesis is None:
             continue
+        # The last one, where an effect is in two groups.
         group = next((g for g in reversed(verdict.groups) if name in g), ())
         out.append(
             {
@@ -249,9 +255,7 @@ def _key(name: Coefficient) -> str:
     return f'{name.parameter}.{name.axis}' if name.axis else name.parameter
 
 
-def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
+def named_effects(report: Report) -> list[str]:
     """Return the effects of the verdict by their share of the gap."""
-    shares = {c['effect']: c['share'] or 0.0 for c in objects['candidates']}
-    return sorted(
-        (name for name in report.verdict.named if name in shares), key=lambda name: -shares[name]
-    )
+    shares = words.shares_of_gap(report)
+    return sorted(report.verdict.named, key=lambda name: -shares.get(name, 0.0))

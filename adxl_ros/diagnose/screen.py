@@ -40,7 +40,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
         lines += wrapped(f'{word}  {words.headline(diagnosis)}', len(word) + 2)
         return lines + _laid_out(notes)
     objects = as_json(diagnosis)
-    named = named_effects(report, objects)
+    named = named_effects(report)
     # The gap, with the effects, and the floor stand in the first line.
     rows = words.figure_rows(diagnosis)[2 + words.closes(report) :]
     labelled = [('figures', '; '.join(f'{row.label} {row.text}' for row in rows))]

@@ -25,9 +25,11 @@ from adxl_ros.diagnose.weighing import (
     HEALTHY,
     is_drifting,
     minimal_sets,
+    most_probable_set,
     NOTHING,
     SHARE_OF_FORM,
     SimulatedAgain,
+    value_of,
 )
 from adxl_ros.report.quantities import Interval
 import numpy as np
@@ -166,14 +168,14 @@ def _powers(
     of_noise: float,
 ) -> _Powers:
     """Weigh what the best set and the noise leave, and drop the drifts where it is none."""
-    explained = max(float(evidence.gain(best, NOTHING)[0]), 0.0)
-    above = float(evidence.left(best)[0]) - of_noise
+    explained = max(evidence.explained(best), 0.0)
+    left = value_of(evidence.left(best))
+    above = left - of_noise
     repeats = evidence.figure(evidence.mean(found.remainder.squares))
     material = repeats.value if found.repeats and repeats.low > remainder_material else 0.0
     if not found.drifts:
         return _Powers(explained, above, material, 0.0, ())
     powers = {d: evidence.candidates[best][d].drift_mps2 ** 2 for d in found.drifts}
-    left = float(evidence.left(best)[0])
     possible = [d for d in found.drifts if powers[d] <= _DRIFT_LIMIT * left]
     if not possible or not found.is_random:
         # The fit of a drift takes up what is none, too.
@@ -182,19 +184,19 @@ def _powers(
 
 
 def _rivals(
-    evidence: Evidence, minimal: Sequence[frozenset[str]], powers: _Powers
+    evidence: Evidence, best: frozenset[str], others: Sequence[frozenset[str]], powers: _Powers
 ) -> list[frozenset[str]]:
     """
-    Return the other sets that could be the answer in place of the first.
+    Return the other sets that could be the answer in place of the best one.
 
     The order of two sets could be that of their errors of form, where these are as large as what
     repeats beside the best set; or that of errors of the reference in motion. Beside a drift
     powers scatter, and the likelihood decides.
     """
-    best = minimal[0]
-    smallest = max(powers.repeats, evidence.errs_in_motion * evidence.reference_mps2**2)
+    of_reference = evidence.reference_mps2**2 if evidence.errs_in_motion else 0.0
+    smallest = max(powers.repeats, of_reference)
     rivals = []
-    for other in minimal[1:]:
+    for other in others:
         is_less_probable = evidence.figure(evidence.nats(best, other)).predicts
         explains_less = evidence.figure(evidence.gain(best, other)).value > smallest
         is_beaten = is_less_probable and (explains_less or bool(powers.drifts))
@@ -221,8 +223,7 @@ def _answer(
     in_noise: Sequence[NoiseCause],
 ) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
-    minimal = minimal_sets(evidence)
-    best = minimal[0]
+    best, *others = minimal_sets(evidence)
     material = evidence.material_power(1.0)
     detected = frozenset(cause.effect for cause in in_noise)
     # Only samples that are compared say what is left.
@@ -238,7 +239,7 @@ def _answer(
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
         is_much = powers.above > max(evidence.floor_mps2**2, material)
         return _Answer('unknown' if is_much else 'no_gap')
-    groups = _groups(best, _rivals(evidence, minimal, powers))
+    groups = _groups(best, _rivals(evidence, best, others, powers))
     certain = best.difference(*groups) | detected
     if len(named) > 1:
         groups |= {named}
@@ -280,17 +281,21 @@ def _best_set(
         sets = filter(None, minimal_sets(weighed))
         return replace(weighed, again={effects: simulate_again(effects) for effects in sets})
 
+    def nats(drifting: Evidence) -> float:
+        best = most_probable_set(drifting)
+        return value_of(drifting.drift_nats(best, drifting.noise, healthy))
+
     evidence = simulated(evidence)
-    healthy = minimal_sets(evidence)[0]
+    healthy = most_probable_set(evidence)
     # In noise that drifts, sets explain less than they seem to beside white noise. The motion
     # that a smooth reference lacks is no drift.
     every = () if evidence.fades else evidence.candidates[healthy]
-    drifting = [replace(evidence, noise=drift) for drift in every if drift != HEALTHY]
-    drifting.sort(key=lambda e: -e.drift_nats(minimal_sets(e)[0], e.noise, healthy)[0])
-    if not drifting or not is_drifting(drifting[0], minimal_sets(drifting[0])[0], healthy):
+    in_drifts = [replace(evidence, noise=drift) for drift in every if drift != HEALTHY]
+    likeliest = max(in_drifts, key=nats, default=None)
+    if likeliest is None or not is_drifting(likeliest, most_probable_set(likeliest), healthy):
         return _BestSet(evidence, healthy, remainder_of(healthy, HEALTHY))
-    evidence = simulated(drifting[0])
-    best = minimal_sets(evidence)[0]
+    evidence = simulated(likeliest)
+    best = most_probable_set(evidence)
     remainder = remainder_of(best, evidence.noise)
     follows_more = evidence.follows(remainder, beside_form(best))
     return _BestSet(
@@ -317,7 +322,7 @@ def decide(
     """
     found = _best_set(evidence, remainder_of, simulate_again)
     evidence, best, remainder = found.evidence, found.effects, found.remainder
-    power = {d: float(evidence.mean(b)[0]) for d, b in remainder.by_dimension.items()}
+    power = {d: value_of(evidence.mean(b)) for d, b in remainder.by_dimension.items()}
     repeats = evidence.interval(evidence.mean(remainder.squares))
     # What follows the pose may be of the reference.
     pose = max((power[d] for d in _POSE & {*power}), default=0.0)
@@ -335,7 +340,7 @@ def decide(
     probability, hypotheses = _probabilities(answer, votes)
     highest = max(evidence.interval(evidence.gain(e, NOTHING)).high for e in evidence.candidates)
     strongest = sorted(power, key=lambda d: -power[d])
-    tolerated = float(evidence.mean(evidence.candidates[NOTHING][HEALTHY].tolerated)[0])
+    tolerated = value_of(evidence.mean(evidence.candidates[NOTHING][HEALTHY].tolerated))
     unseen = max(highest, repeats.high, evidence.material_power(1.0))
     return Verdict(
         status=answer.status,

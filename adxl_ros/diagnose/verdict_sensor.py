@@ -7,15 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from adxl_ros.diagnose.comparison import with_values
-from adxl_ros.diagnose.noise_effects import Detection
+from adxl_ros.diagnose.detection import Detection
 from adxl_ros.diagnose.noise_filters import drifts_among
 from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.diagnose.weighing import drifts_beside, Evidence
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
+from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral, with_values
 import numpy as np
 
 if TYPE_CHECKING:

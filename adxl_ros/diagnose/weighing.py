@@ -48,6 +48,13 @@ _SHOWN_BY_POSE = {
 """Variables over which an effect that only changes with the pose shows."""
 NOTHING: frozenset[str] = frozenset()
 """The set without effects: the baseline."""
+ByDraw = np.ndarray
+"""A figure by draw of the blocks, (draws,); the first one is its value, the others its scatter."""
+
+
+def value_of(figure: ByDraw) -> float:
+    """Return what the rule is applied to: the first value of a figure by draw."""
+    return float(figure[0])
 
 
 class SimulatedAgain(NamedTuple):
@@ -100,13 +107,13 @@ class Evidence:
         """Return one draw of the blocks."""
         return replace(self, weights=self.weights[number : number + 1], is_draw=True)
 
-    def figure(self, draws: np.ndarray) -> Figure:
-        """Return what the rule weighs of a figure with one value for each draw."""
-        value = float(draws[0])
+    def figure(self, draws: ByDraw) -> Figure:
+        """Return what the rule weighs of a figure."""
+        value = value_of(draws)
         return Figure(value, value if self.is_draw else float(np.quantile(draws, _LOWEST)))
 
-    def left(self, effects: frozenset[str]) -> np.ndarray:
-        """Return the power above the noise floor that a set leaves, by draw."""
+    def left(self, effects: frozenset[str]) -> ByDraw:
+        """Return the power above the noise floor that a set leaves."""
         return self.mean(self.candidates[effects][HEALTHY].figures.squares) - self.floor_mps2**2
 
     def material_power(self, pose_share: float) -> float:
@@ -114,8 +121,8 @@ class Evidence:
         share = 1.0 if self.errs_in_motion else pose_share
         return self.material_mps2**2 + share * self.reference_mps2**2
 
-    def mean(self, by_block: np.ndarray) -> np.ndarray:
-        """Return the mean over samples of sums by block, by draw."""
+    def mean(self, by_block: np.ndarray) -> ByDraw:
+        """Return the mean over samples of sums by block."""
         return self.weights @ by_block / np.maximum(self.weights @ self.counts, 1.0)
 
     def is_refuted(self, effects: frozenset[str]) -> bool:
@@ -130,7 +137,7 @@ class Evidence:
         more = again.more_at_rest
         count = max(again.resting, 1.0)
         error = float(np.sqrt(np.sum(more**2))) / count
-        explained = max(float(self.gain(effects, NOTHING)[0]), 0.0)
+        explained = max(self.explained(effects), 0.0)
         smallest = max(self.material_power(1.0), _FORM_AT_REST * explained)
         if self.noise != HEALTHY:
             smallest += self.candidates[effects][self.noise].drift_mps2 ** 2
@@ -154,13 +161,17 @@ class Evidence:
         smallest = _NATS + np.log(max(len(tried), 1))
         return any(figure.value > smallest and figure.low > 0 for figure in figures)
 
-    def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
-        """Return by how much one set explains more power than another, by draw."""
+    def gain(self, more: frozenset[str], less: frozenset[str]) -> ByDraw:
+        """Return by how much one set explains more power than another."""
         return self.mean(self._figures(less).squares - self._figures(more).squares)
 
-    def lost_without(self, effects: frozenset[str], effect: str) -> np.ndarray:
+    def explained(self, effects: frozenset[str]) -> float:
+        """Return the power that a set explains."""
+        return value_of(self.gain(effects, NOTHING))
+
+    def lost_without(self, effects: frozenset[str], effect: str) -> ByDraw:
         """
-        Return what a set explains less without an effect, by draw.
+        Return what a set explains less without an effect.
 
         Beside a drift the squares scatter as it does: what the effect changes is the figure.
         """
@@ -169,14 +180,12 @@ class Evidence:
             return self.gain(effects, effects - {effect})
         return self.mean(drifting.changes[effect])
 
-    def nats(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
-        """Return by how much a set makes held-out samples more probable, by draw."""
+    def nats(self, more: frozenset[str], less: frozenset[str]) -> ByDraw:
+        """Return by how much a set makes held-out samples more probable."""
         gained = self._figures(more).log_likelihood - self._figures(less).log_likelihood
         return self.weights @ gained
 
-    def drift_nats(
-        self, effects: frozenset[str], drift: str, healthy: frozenset[str]
-    ) -> np.ndarray:
+    def drift_nats(self, effects: frozenset[str], drift: str, healthy: frozenset[str]) -> ByDraw:
         """Return by how much a set and a drift are likelier than a set in healthy noise."""
         drifting = self.candidates[effects][drift].figures
         steady = self.candidates[healthy][HEALTHY].figures
@@ -185,16 +194,16 @@ class Evidence:
     def is_beyond_form(self, effects: frozenset[str], others: frozenset[str]) -> bool:
         """Determine whether a set explains materially more than others with errors of form."""
         # No error of form holds a tenth of the power, and most effects of a set hold more.
-        explained = float(self.gain(effects, NOTHING)[0])
         (effect,) = effects - others
-        if float(self.lost_without(effects, effect)[0]) > SHARE_OF_FORM * explained:
+        lost = value_of(self.lost_without(effects, effect))
+        if lost > SHARE_OF_FORM * self.explained(effects):
             return True
         # A weak effect that all blocks do not show is not looked for in draws of them.
         if self.is_draw and others not in self._fits(effects).beside_errors:
             return False
         more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
         gained = self.figure(self.weights @ (more.log_likelihood - less.log_likelihood))
-        lost = float(self.mean(less.squares - more.squares)[0])
+        lost = value_of(self.mean(less.squares - more.squares))
         return gained.predicts and lost > self.material_mps2**2
 
     def _fits(self, effects: frozenset[str]) -> HeldOutFits:
@@ -206,10 +215,11 @@ class Evidence:
         """Return the figures of a set in the present noise, or in healthy noise without it."""
         return self._fits(effects).figures
 
-    def interval(self, draws: np.ndarray) -> Interval:
+    def interval(self, draws: ByDraw) -> Interval:
         """Return the value of all blocks with the interval of the draws."""
+        value = value_of(draws)
         low, high = np.quantile(draws[1:], [_LOWEST, _HIGHEST], method='nearest')
-        return Interval(float(draws[0]), float(min(low, draws[0])), float(max(high, draws[0])))
+        return Interval(value, min(float(low), value), max(float(high), value))
 
 
 def _is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
@@ -244,7 +254,7 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
         for effects in evidence.candidates
         if _is_minimal(evidence, effects) and not evidence.is_refuted(effects)
     ]
-    kept.sort(key=lambda effects: -evidence.nats(effects, NOTHING)[0])
+    kept.sort(key=lambda effects: -value_of(evidence.nats(effects, NOTHING)))
     first = kept[0]
     alternatives = [first]
     for other in kept[1:]:
@@ -255,11 +265,16 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     return [effects for effects in kept if effects not in dropped]
 
 
+def most_probable_set(evidence: Evidence) -> frozenset[str]:
+    """Return the first of the minimal sets."""
+    return minimal_sets(evidence)[0]
+
+
 def drifts_beside(evidence: Evidence, effects: frozenset[str]) -> list[str]:
     """Return the drifts, the best first, that make samples beside a set more probable."""
     tried = [d for d in evidence.candidates[effects] if d != HEALTHY]
     nats = {d: evidence.drift_nats(effects, d, effects) for d in tried}
-    drifts = sorted(nats, key=lambda d: -nats[d][0])
+    drifts = sorted(nats, key=lambda d: -value_of(nats[d]))
     if not drifts or not evidence.figure(nats[drifts[0]]).predicts:
         return []
     best = nats[drifts[0]]
@@ -272,8 +287,7 @@ def is_drifting(evidence: Evidence, effects: frozenset[str], healthy: frozenset[
 
     The drift must be material beside what the set explains in the same noise.
     """
-    explained = float(evidence.gain(effects, NOTHING)[0])
-    smallest = max(evidence.material_mps2**2, _SHARE_OF_SET * explained)
+    smallest = max(evidence.material_mps2**2, _SHARE_OF_SET * evidence.explained(effects))
     is_material = evidence.candidates[effects][evidence.noise].drift_mps2 ** 2 > smallest
     nats = evidence.drift_nats(effects, evidence.noise, healthy)
     return is_material and evidence.figure(nats).predicts

@@ -19,8 +19,8 @@ import tempfile
 from typing import BinaryIO
 
 from adxl_ros.errors import UserError
-from adxl_ros.process import option
 from adxl_ros.report.arguments import require_path
+from adxl_ros.wording import option
 
 AnyPath = str | os.PathLike  # A path, as the functions of Python take it
 _SUFFIX = '.part'  # End of the names of directories in which new files are written

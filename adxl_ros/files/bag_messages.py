@@ -24,7 +24,7 @@ from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.stream_info import NOMINAL_KEYS
 from adxl_ros.model.constants import MEASURED_AXES
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 

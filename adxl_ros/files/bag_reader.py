@@ -42,7 +42,7 @@ from adxl_ros.files.recording_columns import (
 from adxl_ros.files.reference_track import LONGEST_MOVE_NS, seconds, Track
 from adxl_ros.files.stamp_check import StampCheck
 from adxl_ros.model.constants import AXES, MEASURED_AXES
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 
 _ABSENT_VARIANCE = 1e5

@@ -44,7 +44,11 @@ _OTHER_FORMATS = {
     *('.csv', '.tsv', '.txt', '.json', '.yaml', '.xlsx', '.h5', '.feather', '.npy', '.pkl'),
     *('.mcap', '.db3', '.bag'),
 }
-"""Ends of the names of files, in lower case, that are no bags or only read."""
+"""
+Ends of the names of files, in lower case, that are no bags or only read.
+
+Of them '.mcap' is written where it is in lower case.
+"""
 _VOLTAGE = np.array([0.0, *[np.nan] * 6], np.float32)
 """Voltage of a battery; temperature, current, charge, capacities and percentage are unknown."""
 _FLUSH_NS = 500_000_000
@@ -156,13 +160,13 @@ def recording_bag(path: AnyPath, sensor: Sensor) -> Iterator[Callable[[Recording
                         bag, part.stamp_ns, _changes(part.columns), COMMANDS, '/stage/command'
                     ),
                 ]
-                for column, (topic, field, form) in _SCALARS.items():
-                    values = part.columns.get(column, np.zeros(0))
-                    if not np.isnan(values).all():
-                        known = ~np.isnan(values)
-                        batches.append(
-                            bag.batch(topic, form, part.stamp_ns[known], {field: values[known]})
-                        )
+                for column, scalar in _SCALARS.items():
+                    values = part.columns.get(column, np.full(len(part), np.nan))
+                    is_known = ~np.isnan(values)
+                    if is_known.any():
+                        fields = {scalar.field: values[is_known]}
+                        stamp_ns = part.stamp_ns[is_known]
+                        batches.append(bag.batch(scalar.topic, scalar.form, stamp_ns, fields))
                 bag.append(batches)
 
         yield append
@@ -186,15 +190,15 @@ def _write_info(bag: _NewBag, recording: Recording, sensor: Sensor) -> None:
     )
     forever = ros.QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
     latched = ros.Qos(
-        ros.QosHistory.KEEP_LAST,
-        1,
-        ros.QosReliability.RELIABLE,
-        ros.QosDurability.TRANSIENT_LOCAL,
-        forever,
-        forever,
-        ros.QosLiveliness.AUTOMATIC,
-        forever,
-        False,
+        history=ros.QosHistory.KEEP_LAST,
+        depth=1,
+        reliability=ros.QosReliability.RELIABLE,
+        durability=ros.QosDurability.TRANSIENT_LOCAL,
+        deadline=forever,
+        lifespan=forever,
+        liveliness=ros.QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=forever,
+        avoid_ros_namespace_conventions=False,
     )
     bag.writer.write(
         bag.connection('/sensor_info', DIAGNOSTIC_STATUS, [latched]),
@@ -217,9 +221,9 @@ def _joint_batches(
     for pattern in np.unique(is_sampled, axis=0):
         rows = (is_sampled == pattern).all(axis=1)
         sampled = [joint for joint, is_there in zip(names, pattern) if is_there]
-        template = cdr.message(
-            '', len(sampled), *sampled, len(sampled), np.zeros(len(sampled)), 0, 0
-        )
+        count = len(sampled)
+        # Frame, names, positions, no velocities, no efforts; each array begins with its length.
+        template = cdr.message('', count, *sampled, count, np.zeros(count), 0, 0)
         if sampled:
             yield bag.batch(
                 topic,
@@ -277,13 +281,21 @@ def _imu_form(covariance: np.ndarray) -> TopicForm:
     )
 
 
+class _Scalar(NamedTuple):
+    """The topic of a reference that is one number."""
+
+    topic: str
+    field: str  # Field of its messages
+    form: TopicForm
+
+
 _SCALARS = {
-    'temperature_c': (
+    'temperature_c': _Scalar(
         '/temperature',
         'temperature',
         TopicForm(TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2))),
     ),
-    'supply_v': (
+    'supply_v': _Scalar(
         '/supply',
         'voltage',
         TopicForm(
@@ -294,7 +306,7 @@ _SCALARS = {
         ),
     ),
 }
-"""Topic, field and form of references that are one number, by column."""
+"""References that are one number, by column."""
 
 
 @contextmanager
@@ -319,12 +331,11 @@ def tilt_bag(path: AnyPath) -> Iterator[Callable[..., None]]:
 
         def append(stamp_ns: np.ndarray, imu_fields: Columns, tilt_rad: np.ndarray) -> None:
             if len(stamp_ns):
+                fields = {'/imu/data': imu_fields, '/tilt': {'vector': tilt_rad}}
                 bag.append(
                     [
-                        bag.batch(topic, form, stamp_ns, fields)
-                        for (topic, form), fields in zip(
-                            forms.items(), (imu_fields, {'vector': tilt_rad})
-                        )
+                        bag.batch(topic, form, stamp_ns, fields[topic])
+                        for topic, form in forms.items()
                     ]
                 )
 

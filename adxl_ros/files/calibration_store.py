@@ -104,17 +104,17 @@ def date_in(text: str) -> datetime | None:
 
 def sensor_folder(folder: AnyPath, serial: str) -> Path:
     """Return the folder of a sensor."""
-    return Path(folder) / _name(serial)
+    return Path(folder) / file_name(serial)
 
 
-def _name(serial: str) -> str:
-    """Return a serial number as a file name: quoted by %, and hashed where it is too long."""
-    quoted = quote(serial, safe=" #+,;=@()[]'")
+def file_name(text: str) -> str:
+    """Return a text as the name of a file: quoted by %, and hashed where it is too long."""
+    quoted = quote(text, safe=" #+,;=@()[]'")
     if not quoted.strip('.'):
         quoted = quoted.replace('.', '%2E')
     if len(quoted) <= _MAX_NAME:
         return quoted
-    return f'{quoted[:_MAX_NAME]}-{hashlib.sha256(serial.encode()).hexdigest()[:16]}'
+    return f'{quoted[:_MAX_NAME]}-{hashlib.sha256(text.encode()).hexdigest()[:16]}'
 
 
 def put(folder: AnyPath, sensor: Sensor, comments: Iterable[str] = ()) -> Path | None:
@@ -128,7 +128,7 @@ def put(folder: AnyPath, sensor: Sensor, comments: Iterable[str] = ()) -> Path |
         raise UserError(
             f'{folder_of_sensor}: cannot be made: {error.strerror}; name another store'
         ) from None
-    path = folder_of_sensor / f'{_name(sensor.serial)}-{_version(sensor)}.yaml'
+    path = folder_of_sensor / f'{file_name(sensor.serial)}-{_version(sensor)}.yaml'
     parameter_file.save(path, sensor, comments)
     return path
 
@@ -165,7 +165,7 @@ def newest(folder: AnyPath, serial: str, check: Callable[[Sensor], None]) -> Cho
 
 def newer(folder: AnyPath, sensor: Sensor) -> Path | None:
     """Return the newest file of a sensor if its name has a later date; no file is read."""
-    begin = f'{_name(sensor.serial)}-'
+    begin = f'{file_name(sensor.serial)}-'
     files = [
         path
         for path in sensor_folder(folder, sensor.serial).glob('*.yaml')

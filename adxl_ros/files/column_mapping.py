@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2, MEASURED_AXES
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 
 _EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'  # A mapping, for messages

@@ -42,7 +42,7 @@ from adxl_ros.files.stamp_check import StampCheck
 from adxl_ros.files.table_stamps import CountedStamps, StampColumn
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.kinematics import stage_angles
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 
 _TURN_RAD = 2 * np.pi  # Largest roll and pitch, rad

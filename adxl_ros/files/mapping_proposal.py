@@ -32,7 +32,7 @@ from adxl_ros.files.column_mapping import (
 )
 from adxl_ros.files.stamps import burst_samples, stamped_rate_hz
 from adxl_ros.model.constants import AXES
-from adxl_ros.process import option, pasted
+from adxl_ros.wording import option, pasted
 import numpy as np
 
 _TIME_NAMES = re.compile(

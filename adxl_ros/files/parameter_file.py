@@ -27,7 +27,8 @@ import yaml
 
 FORMAT = 1  # Version of the format. A file of another version is refused
 
-UNITS = 'V, V/g, 1/g, rad'  # Units of the coefficients: written into every file, and checked
+COEFFICIENT_UNITS = 'V, V/g, 1/g, rad'
+"""Units of the coefficients: written into every file, and checked."""
 
 SENSOR_FIELDS: dict[str, Field[Any]] = {
     field.metadata['key']: field for field in fields(Sensor) if field.metadata
@@ -150,14 +151,16 @@ def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool 
             f'version {flat.get("format")!r}, but this package reads '
             f'version {FORMAT}; fit the calibration again, or update the package',
         )
-    if flat.get('units', UNITS) != UNITS:
-        raise make_error('units', f'{flat["units"]!r}, but coefficients are in {UNITS!r}')
+    if flat.get('units', COEFFICIENT_UNITS) != COEFFICIENT_UNITS:
+        raise make_error(
+            'units', f'{flat["units"]!r}, but coefficients are in {COEFFICIENT_UNITS!r}'
+        )
     return _FlatReader(flat, make_error).sensor(may_measure)
 
 
 def to_flat(sensor: Sensor) -> dict[str, Any]:
     """Return the parameters of a sensor's file by dotted key, plain Python values, in order."""
-    flat: dict[str, Any] = {'format': FORMAT, 'units': UNITS, 'model': sensor.model}
+    flat: dict[str, Any] = {'format': FORMAT, 'units': COEFFICIENT_UNITS, 'model': sensor.model}
     for key, field in SENSOR_FIELDS.items():
         value = getattr(sensor, field.name)
         is_default = field.default is not MISSING and value == field.default

@@ -30,7 +30,7 @@ from adxl_ros.files.recording_columns import ACCEL, concatenate, GYRO, Recording
 from adxl_ros.files.tables import BLOCK_ROWS, open_table
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 
 _MAGIC_BYTES = 16  # Bytes at the beginning of a file that show its format

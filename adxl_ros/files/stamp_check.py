@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.stamps import describe_bursts
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 
 

@@ -30,9 +30,11 @@ _EVEN_DEVIATION = 0.02
 """Largest deviation of even steps, as a share of them (chosen: rate right to 0.5 %)."""
 _EVEN_QUANTILE = 0.9
 """Share of the steps that are even (chosen: a few losses or delays are common)."""
-_LAG = 64
+_MOST_APART = 64
 """Most samples, or bursts, over which the first estimate of a period is taken (chosen: delays
 hardly change their time, and most such spans hold no pause)."""
+_LARGEST_PART = 4
+"""Part of all of them, 1/4, that it is taken over at most (chosen: a median of many spans)."""
 _LACKING_STEP = 1.5
 """Step from which a sample may be missing, periods (between one period and two)."""
 _NEARBY = (0.75, 1.5, 3.0, 6.0)
@@ -87,12 +89,12 @@ def without_stalls(time_s: np.ndarray, period_s: float, shortest_s: float) -> np
     What waited came at once: it is evenly spaced from the sample before.
     """
     mended_s = time_s.copy()
-    lag_s = time_s - period_s * np.arange(len(time_s))
+    late_s = time_s - period_s * np.arange(len(time_s))
     is_stall = (np.diff(time_s) > period_s + shortest_s) & ~lacks_samples(time_s, period_s)
     for i in np.flatnonzero(is_stall).tolist():
         usual_s = mended_s[i] - period_s * i + period_s / 2
         stop = i + 1
-        while stop < len(time_s) and lag_s[stop] > usual_s:
+        while stop < len(time_s) and late_s[stop] > usual_s:
             stop += 1
         mended_s[i + 1 : stop] = mended_s[i] + period_s * np.arange(1, stop - i)
     return mended_s
@@ -103,23 +105,22 @@ def mean_period_s(time_s: np.ndarray) -> float:
     ends = burst_ends(time_s)
     if len(ends) < 2:
         ends = np.array([0, len(time_s) - 1])
-    lag = max(min(_LAG, (len(ends) - 1) // 4), 1)
-    period_s = float(
-        np.median((time_s[ends[lag:]] - time_s[ends[:-lag]]) / (ends[lag:] - ends[:-lag]))
-    )
+    apart = max(min(_MOST_APART, (len(ends) - 1) // _LARGEST_PART), 1)
+    begin = ends[:-apart]
+    end = ends[apart:]
+    period_s = float(np.median((time_s[end] - time_s[begin]) / (end - begin)))
     # From the end of a burst to the end of another one, so that all of them are whole.
     whole_s = time_s[ends[0] : ends[-1] + 1]
     steps_s = np.diff(whole_s)
+    before_s = 0.0
     for _ in range(_ROUNDS):
-        if not period_s > 0:
+        if period_s == before_s or not period_s > 0:
             break
-        complete = ~lacks_samples(whole_s, period_s)
-        if not complete.any():
+        is_complete = ~lacks_samples(whole_s, period_s)
+        if not is_complete.any():
             break
-        before = period_s
-        period_s = float(steps_s[complete].mean())
-        if period_s == before:
-            break
+        before_s = period_s
+        period_s = float(steps_s[is_complete].mean())
     return max(period_s, 0.0)
 
 

@@ -21,7 +21,7 @@ from adxl_ros.files.column_mapping import (
 )
 from adxl_ros.files.stamp_check import StampCheck
 from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
-from adxl_ros.process import option, pasted
+from adxl_ros.wording import option, pasted
 import numpy as np
 
 _TIME_LIMIT_S = 9e9  # Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)
@@ -39,7 +39,7 @@ class StampedRows(NamedTuple):
 
 
 class CountedStamps:
-    """Counts the rows of a table at a rate."""
+    """Counts the rows of a table at a rate; used as `StampColumn` is."""
 
     def __init__(self, rate_hz: float, is_every_row_a_step: bool) -> None:
         self.epoch_ns = 0  # Origin of the stamps, ns
@@ -125,17 +125,18 @@ class StampColumn:
         if is_sensor_step(1 / rate_hz, is_whole):
             return
         step = self._unit.divisor / rate_hz
-        unit = time_unit_of_step(step, is_whole)
-        right = f'if that is right, give {option(rate=f"{rate_hz:.6g}")}'
-        if is_whole and step == 1:
-            right = f'if it counts samples, give {option(rate="HZ")}'
-        paste = ''
-        if unit != self._source.unit:
-            right += f', and if they are {unit}:'
-            time = self._source._replace(unit=unit)
-            paste = pasted(columns=str(ColumnMapping({**self._sources, 'time': time})))
-        raise UserError(
+        found = (
             f'{self._path}: {self._source.column} has steps of {step:.4g}, which as '
-            f'{self._source.unit} are {rate_hz:.6g} Hz; {right}',
-            paste,
+            f'{self._source.unit} are {rate_hz:.6g} Hz'
+        )
+        keep = f'if that is right, give {option(rate=f"{rate_hz:.6g}")}'
+        if is_whole and step == 1:
+            keep = f'if it counts samples, give {option(rate="HZ")}'
+        unit = time_unit_of_step(step, is_whole)
+        if unit == self._source.unit:
+            raise UserError(f'{found}; {keep}')
+        time = self._source._replace(unit=unit)
+        raise UserError(
+            f'{found}; {keep}, and if they are {unit}:',
+            pasted(columns=str(ColumnMapping({**self._sources, 'time': time}))),
         )

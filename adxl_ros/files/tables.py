@@ -19,7 +19,7 @@ from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import Table, TableBlock
 from adxl_ros.files.csv_file import find_form, read_blocks
 from adxl_ros.model.kinematics import stage_angles
-from adxl_ros.process import option
+from adxl_ros.wording import option
 import numpy as np
 
 BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)

@@ -149,7 +149,8 @@ def _of_listing(
         bag = next(
             (str(folder) for folder in PurePosixPath(name).parents if str(folder) in bags), ''
         )
-        if bag or (file_name(name) != TABLE and (name in named or _is_recording_name(name))):
+        is_recording = name in named or _is_recording_name(name)
+        if bag or (is_recording and file_name(name) != TABLE):
             found.setdefault(bag or name, {})[name] = info
     sources = [
         _of_files(fs, name, content)
@@ -342,9 +343,8 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[FoundRecordi
 
 def _beside(folder: str, url: str) -> str:
     """Return an address of a manifest; one that is relative counts from the manifest's folder."""
-    if not url or '://' in url or Path(url).is_absolute() or not folder:
-        return url
-    return f'{folder}/{url}'
+    is_whole = '://' in url or Path(url).is_absolute()
+    return f'{folder}/{url}' if folder and url and not is_whole else url
 
 
 class Stated(NamedTuple):

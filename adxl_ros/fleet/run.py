@@ -212,7 +212,8 @@ def is_done(source: FoundRecording, entry: Entry | None, recipe: Recipe) -> bool
     if entry is None or source.stamp != entry.stamp or not (source.stamp or source.fault):
         return False
     row = entry.row
-    if source.date != (row['date'] if row['date_source'] == 'manifest' else ''):
+    stated_date = row['date'] if row['date_source'] == 'manifest' else ''
+    if source.date != stated_date:
         return False
     parameters = recipe.parameters_of(
         source.serial or row['serial'] or '', source.date or row['date'] or '', source.params

@@ -43,8 +43,9 @@ from adxl_ros.fleet.row import (
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import code_version, options_named, package_version
+from adxl_ros.process import code_version, package_version
 from adxl_ros.signals.findings import check_recording, Findings
+from adxl_ros.wording import options_named
 import numpy as np
 
 _SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB

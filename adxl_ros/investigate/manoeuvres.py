@@ -70,7 +70,7 @@ class StagePath:
         """Begin at rest in a pose."""
         self.limits = limits  # The limits
         self._begin_s = begin_s
-        self._script = Script(*limits.nearest(*pose), now=begin_s, slew_rad_s=limits.rate_rad_s)
+        self._script = Script(*limits.nearest(*pose), now_s=begin_s, slew_rad_s=limits.rate_rad_s)
         self._script.rest(0.5)
 
     def rest(self, alpha_deg: float, beta_deg: float, seconds: float = _REST_S) -> None:
@@ -84,7 +84,7 @@ class StagePath:
         """Turn one joint at a constant rate, and rest for a second."""
         to_rad = float(np.clip(to_rad, *self.limits.of(joint)))
         rate_rad_s = share * self.limits.rate_rad_s
-        distance_rad = abs(to_rad - getattr(self._script, joint))
+        distance_rad = abs(to_rad - getattr(self._script, f'{joint}_rad'))
         if distance_rad > rate_rad_s * RUN_UP_S:
             self._script.run(joint, to_rad, rate_rad_s)
         elif distance_rad > 0:
@@ -93,7 +93,7 @@ class StagePath:
 
     def swing(self, joint: str, share: float = 1.0) -> None:
         """Turn one joint about its angle, forth and back."""
-        middle_rad = getattr(self._script, joint)
+        middle_rad = getattr(self._script, f'{joint}_rad')
         low_rad, high_rad = self.limits.of(joint)
         # A joint at its limit swings to the inner side.
         middle_rad = min(
@@ -116,11 +116,11 @@ class StagePath:
     def motion(self) -> Motion:
         """Return the path as a motion that begins at its own time."""
         alpha, beta = self._script.joints()
-        return Motion(self._script.now - self._begin_s, alpha, beta)
+        return Motion(self._script.now_s - self._begin_s, alpha, beta)
 
     def end(self) -> Pose:
         """Return the pose at the end."""
-        return Pose(self._script.alpha, self._script.beta)
+        return Pose(self._script.alpha_rad, self._script.beta_rad)
 
 
 class CatalogueManoeuvre(NamedTuple):

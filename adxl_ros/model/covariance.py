@@ -112,10 +112,12 @@ def measured_covariance(
             )
         if tangent.slope and not is_upright_certain:
             other_v = respond([*force[:2], -force[2]], environment)
-            change_v = np.array(
-                [np.subtract(v, o) for v, o in zip(respond(force, environment), other_v)]
-            ).reshape(2, -1)
-            apart = np.einsum('ijn,jn->in', np.asarray(tangent.back).reshape(2, 2, -1), change_v)
+            change_v = list(map(np.subtract, respond(force, environment), other_v))
+            apart = np.einsum(
+                'ijn,jn->in',
+                np.asarray(tangent.back).reshape(2, 2, -1),
+                np.reshape(change_v, (2, -1)),
+            )
             measured += np.einsum('in,jn->ijn', apart, apart) / 2
         for d, std_g in enumerate(envelope.zero_g_std_g(environment.temperature_c)):
             measured[d, d] += (G0_MPS2 * std_g) ** 2
@@ -183,13 +185,13 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     derivatives, (m, k, n).
     """
     names = sensor.covariance_names
-    steps = [_RELATIVE_STEP * parameter_of(name).scale for name in names]
+    steps = _RELATIVE_STEP * np.array([parameter_of(name).scale for name in names])
 
     def response_at(name: Coefficient, change: float) -> Callable[..., Components]:
         return static_response(put(sensor, [name], get(sensor, [name]) + change))
 
-    above = [response_at(name, step) for name, step in zip(names, steps)]
-    below = [response_at(name, -step) for name, step in zip(names, steps)]
+    above = list(map(response_at, names, steps))
+    below = list(map(response_at, names, -steps))
 
     def by_coefficient(
         force: Components, environment: Environment = NOMINAL_ENVIRONMENT

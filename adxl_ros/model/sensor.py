@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, MISSING, replace
 from itertools import chain, compress
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Parameters
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Effect, Parameter, Parameters
 from adxl_ros.model.gyroscope import Gyroscope
 import numpy as np
 
@@ -477,6 +477,27 @@ def without_effect(sensor: Sensor, effect: str) -> Sensor:
         sensor.with_covariance_of([name.effect != effect for name in sensor.covariance_names]),
         effects=tuple(name for name in sensor.effects if name != effect),
         values={name: value for name, value in sensor.values.items() if name != effect},
+    )
+
+
+def with_values(sensor: Sensor, effect: str, values: Mapping[str, Any]) -> Sensor:
+    """Return a sensor with changed parameters of an effect; one number stands for all axes."""
+    before = sensor.values[effect]
+    changed = {name: np.full_like(before[name], value, float) for name, value in values.items()}
+    return replace(sensor, values={**sensor.values, effect: {**before, **changed}})
+
+
+def noiseless(sensor: Sensor) -> Sensor:
+    """Return the sensor without noise and without the steps of its ADC."""
+    mean = tuple(e for e in sensor.effects if effect_named(e).acts_on is ActsOn.MEAN)
+    # Without an ADC there are no rails, and pseudo-volts may be negative.
+    bits = 48 if sensor.adc_bits else 0
+    return replace(
+        sensor,
+        noise_density_g_per_rthz=np.zeros(len(sensor.axes)),
+        adc_bits=bits,
+        effects=mean,
+        values={e: sensor.values[e] for e in mean},
     )
 
 

@@ -11,7 +11,6 @@ from enum import Enum
 from functools import partial
 from itertools import takewhile
 
-from adxl_ros.diagnose.comparison import noiseless
 from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.model import noise
@@ -19,7 +18,7 @@ from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.kinematics import gravity_slopes
-from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.model.sensor import noiseless, Sensor, to_nominal_mps2
 from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot, RobotPath
@@ -144,7 +143,7 @@ class ReferenceStream:
         """Add messages of the stage; a joint that one does not name is where it was before."""
         rows = []
         for position in positions:
-            values = [position.get(joint, held) for joint, held in zip(JOINTS, self._held)]
+            values = list(map(position.get, JOINTS, self._held))
             self._held = values if np.isfinite(values).all() else self._held
             rows.append(values)
         self.add_readings(np.array(stamps_ns, np.int64), np.array(rows).reshape(-1, len(JOINTS)))

@@ -27,8 +27,9 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Parameter
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
-from adxl_ros.process import ended_by_closed_output, options_named
+from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.screen import coloured, program_parser
+from adxl_ros.wording import options_named
 import numpy as np
 
 _LONGEST_S = 600.0

@@ -95,7 +95,9 @@ class _Receiver:
     @property
     def ramp(self) -> float:
         """Return the share of the newest change that is in use, 0 to 1."""
-        return 1.0 - len(self._waiting) / _STEPS if len(self._waiting) > 1 else 1.0
+        # A single one is the last step, or a calibration that is sent at once.
+        steps_left = len(self._waiting) if len(self._waiting) > 1 else 0
+        return 1.0 - steps_left / _STEPS
 
     def change(self, before: Sensor, after: Sensor) -> None:
         """Send a calibration in small steps from the one before."""
@@ -177,28 +179,19 @@ class KeepCalibrated(Node):
     def _begin(self, sensor: Sensor) -> _Keeping:
         """Keep a calibration, or go on with its journal."""
         own = self._own
-        first = sensor.provenance.get(KEPT)
-        name = first or calibration_store.calibration_id(sensor)
         folder = make_folder(
             calibration_store.sensor_folder(Path(own.output).expanduser(), sensor.serial)
         )
-        path = folder / f'{calibration_store.sensor_folder("", name)}.jsonl'
-        head: dict[str, Any] = {'kind': 'kept', 'base': parameter_file.to_flat(sensor)}
-        if path.exists() and path.stat().st_size:
-            head = read(path).head
-            sensor = parameter_file.from_flat(head['base'], params_files.parameter_error)
-        elif first:
-            self.get_logger().info(f'{path}: is not there; the journal begins anew')
-        journal = Journal(path, head)
+        journal, base = self._journal(folder, sensor)
         entries = journal.entries
         keeper = Keeper(
-            sensor,
+            base,
             KeepSettings(own.drift_mg_per_year),
             entries,
             journal.append,
             may_adopt=not own.dry_run,
         )
-        stream = RestStream(sensor)
+        stream = RestStream(base)
         stream.go_on_after(
             max((entry.stay for entry in entries if isinstance(entry, NaturalRest)), default=0)
         )
@@ -207,10 +200,23 @@ class KeepCalibrated(Node):
         self._keeping = _Keeping(keeper, stream, journal, receiver)
         self._obstacle = ''
         self.get_logger().info(
-            f'keeping {calibration_store.calibration_id(sensor)} up to date, '
-            f'{len(entries)} entries in {path}'
+            f'keeping {calibration_store.calibration_id(base)} up to date, '
+            f'{len(entries)} entries in {journal.path}'
         )
         return self._keeping
+
+    def _journal(self, folder: Path, sensor: Sensor) -> tuple[Journal, Sensor]:
+        """Open the journal of a calibration; return it, and the calibration that it began with."""
+        first = sensor.provenance.get(KEPT)
+        name = first or calibration_store.calibration_id(sensor)
+        path = folder / f'{calibration_store.file_name(name)}.jsonl'
+        head: dict[str, Any] = {'kind': 'kept', 'base': parameter_file.to_flat(sensor)}
+        if path.exists() and path.stat().st_size:
+            head = read(path).head
+            sensor = parameter_file.from_flat(head['base'], params_files.parameter_error)
+        elif first:
+            self.get_logger().info(f'{path}: is not there; the journal begins anew')
+        return Journal(path, head), sensor
 
     def _on_info(self, info: StreamInfo) -> None:
         try:
@@ -219,8 +225,12 @@ class KeepCalibrated(Node):
             check_same_sensor(info, info.axes or sensor.axes, sensor)
             self._obstacle = ''
         except UserError as error:
-            self._obstacle = str(error)
-            self.get_logger().error(self._obstacle)
+            self._stop(error)
+
+    def _stop(self, error: UserError) -> None:
+        """Use no sample until what is wrong is mended."""
+        self._obstacle = str(error)
+        self.get_logger().error(self._obstacle)
 
     def _stored(self, info: StreamInfo) -> Sensor:
         """Return the newest calibration of the unit in the store."""
@@ -267,8 +277,7 @@ class KeepCalibrated(Node):
         try:
             adopted = keeper.add(rest)
         except UserError as error:
-            self._obstacle = str(error)
-            self.get_logger().error(self._obstacle)
+            self._stop(error)
             return
         if adopted is not None:
             stored = self._exchange(keeping, before, keeper.sensor)
@@ -315,7 +324,9 @@ class KeepCalibrated(Node):
         silence = self._obstacle or self._samples.silence()
         if self._keeping is None:
             return Status(Level.WARN, silence, NO_SERIAL, {})
-        keeper, stream, _, receiver = self._keeping
+        keeper = self._keeping.keeper
+        stream = self._keeping.stream
+        receiver = self._keeping.receiver
         serial = keeper.sensor.serial
         state = keeper.state(self._newest_ns or self.get_clock().now().nanoseconds)
         values = _values(keeper.sensor, state)
@@ -325,26 +336,24 @@ class KeepCalibrated(Node):
             'ramp': receiver.ramp,
             'compensation': 'runs' if receiver.is_there else 'not there',
         }
-        fault = self._samples.fault() or receiver.refusal
-        if fault or state.changed:
-            return Status(Level.ERROR, fault or state.changed, serial, values)
+        fault = self._samples.fault() or receiver.refusal or state.changed
+        has_no_temperature = stream.counts['without_temperature'] and not stream.counts['rests']
+        if fault:
+            return Status(Level.ERROR, fault, serial, values)
+        if not silence and has_no_temperature:
+            silence = (
+                f'nothing on {self.resolve_topic_name("temperature")}, which tells age from '
+                'temperature: no rest is used'
+            )
         if silence:
             return Status(Level.WARN, silence, serial, values)
-        if stream.counts['without_temperature'] and not stream.counts['rests']:
-            return Status(
-                Level.WARN,
-                f'nothing on {self.resolve_topic_name("temperature")}, which tells age from '
-                'temperature: no rest is used',
-                serial,
-                values,
-            )
-        if state.proposal and self._own.dry_run:
-            return Status(Level.OK, f'dry run, would adopt: {state.proposal}', serial, values)
         text = f'kept: acceleration within {state.error_90_mg:.2g} mg (90 %)'
         if math.isfinite(state.tilt_90_deg):
             text += f', tilt within {state.tilt_90_deg:.2g}°'
         if receiver.ramp < 1:
             text += f'; a new calibration comes into use, {receiver.ramp:.0%}'
+        if state.proposal and self._own.dry_run:
+            text = f'dry run, would adopt: {state.proposal}'
         return Status(Level.OK, text, serial, values)
 
 

@@ -279,16 +279,13 @@ class Monitor(Node):
 
     def _diagnose_if_due(self) -> None:
         """Diagnose a change, or the first open gap, once there are enough samples."""
-        is_due = (
-            self._own.automatic
-            and self._run is None
-            and time.monotonic() - self._diagnosed_s >= _PAUSE_S
-            and self._live.span_s(self._changed_ns) >= self._settings.wait_s
-        )
-        if is_due and (
-            self._changed_ns
-            or (self._result is None and any(gap.is_open for gap in self._live.report()))
-        ):
+        may_begin = self._own.automatic and self._run is None
+        has_paused = time.monotonic() - self._diagnosed_s >= _PAUSE_S
+        if not (may_begin and has_paused):
+            return
+        has_samples = self._live.span_s(self._changed_ns) >= self._settings.wait_s
+        is_first_gap = self._result is None and any(gap.is_open for gap in self._live.report())
+        if has_samples and (self._changed_ns or is_first_gap):
             self._begin_diagnosis(self._changed_ns)
             self._changed_ns = 0
             self._diagnosed_s = time.monotonic()

@@ -19,8 +19,9 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters
 from adxl_ros.nodes.parameters import Kind, Spec
-from adxl_ros.process import ended_by_closed_output, options_named
+from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.screen import program_parser
+from adxl_ros.wording import options_named
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node

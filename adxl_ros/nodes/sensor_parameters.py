@@ -62,7 +62,7 @@ def is_from_file(node: Node) -> bool:
 def sensor_specs() -> Iterator[Spec]:
     """Yield the parameters of a parameter file."""
     yield Spec('format', parameter_file.FORMAT, 'version of the parameter file')
-    yield Spec('units', parameter_file.UNITS, 'units of the coefficients')
+    yield Spec('units', parameter_file.COEFFICIENT_UNITS, 'units of the coefficients')
     for name, described in parameter_file.SENSOR_FIELDS.items():
         about = described.metadata
         yield Spec(

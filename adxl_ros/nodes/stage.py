@@ -292,14 +292,9 @@ class StageBridge:
         """Take a command of `stage/command`."""
         positions = dict(zip(message.name, message.position))
         before_rad = np.where(np.isfinite(self._goal_rad), self._goal_rad, self._angles_rad)
-        goal_rad = np.array(
-            [positions.get(name, angle) for name, angle in zip(_ANGLES, before_rad.tolist())]
-        )
-        if (
-            set(positions) - set(_ANGLES)
-            or len(message.name) != len(message.position)
-            or not np.isfinite([*goal_rad, *self._angles_rad]).all()
-        ):
+        goal_rad = np.array(list(map(positions.get, _ANGLES, before_rad)))
+        is_of_stage = positions.keys() <= {*_ANGLES} and len(message.name) == len(message.position)
+        if not (is_of_stage and np.isfinite([goal_rad, self._angles_rad]).all()):
             reason = (
                 f'stage/command: {positions}: expected finite positions of alpha and beta, '
                 f'and first a position on {self._states_topic}'

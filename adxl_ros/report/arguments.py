@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.process import option
+from adxl_ros.wording import option
 
 
 def require_number(argument: str, value: object) -> None:

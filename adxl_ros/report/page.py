@@ -20,9 +20,10 @@ from typing import Any
 from urllib.parse import unquote_plus
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.process import command, names_options, package_version
+from adxl_ros.process import command, package_version
 from adxl_ros.report import templates
 from adxl_ros.report.figures import png
+from adxl_ros.wording import names_options
 
 _DPI = 100  # Resolution of pictures, dots per inch (chosen: sharp at the page's width)
 _GZIP_LEVEL = 6

@@ -180,6 +180,14 @@ def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[i
     return [(int(first), int(stop)) for first, stop in pairwise(edges) if mask[first]]
 
 
+def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Replace rows, (n, k), that are not used by straight lines between those that are."""
+    if used.all() or not used.any():
+        return data
+    number, kept = np.arange(len(used)), np.flatnonzero(used)
+    return np.array([np.interp(number, kept, column[kept]) for column in data.T]).T
+
+
 def held_values(values: np.ndarray, known: np.ndarray, before: float = np.nan) -> np.ndarray:
     """Hold each known value until the next one, (n,); `before` is the value before the first."""
     last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
@@ -212,8 +220,7 @@ def quiet_variance(
     step²/4. Samples without any noise still have a rounding error.
     """
     smallest = step**2 / 4 + _rounding(blocks)
-    of_axes = [_quietest(variances, least) for variances, least in zip(windows.T, smallest)]
-    variance, ratio = np.array(of_axes).T
+    variance, ratio = np.transpose(list(map(_quietest, windows.T, smallest)))
     return variance, ratio * variance
 
 

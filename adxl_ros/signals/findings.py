@@ -22,12 +22,12 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import usage
 from adxl_ros.report.quantities import counted, duration
 from adxl_ros.signals import findings_text as text
 from adxl_ros.signals.allan_deviation import shortest_rest_s
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.recording_contents import examine, log_delay_s, RecordingContents
+from adxl_ros.wording import usage
 import numpy as np
 
 _LARGEST_MISSING = 0.01  # Share of missing samples of a sound log. Chosen: a lossy link loses less

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, duration
+from adxl_ros.wording import option
 
 if TYPE_CHECKING:
     from adxl_ros.signals.recording_contents import RecordingContents

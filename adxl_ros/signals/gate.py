@@ -21,10 +21,10 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import recorded_nominal, Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.rest_detection import rests_of
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 
@@ -199,11 +199,12 @@ def _zero_g(new: _AtRest, old: _AtRest) -> Outcome:
         return Outcome(
             'zero-g', False, f'not compared: needs three axes and {_FEWEST_POSES} rests in both'
         )
-    low, high = _change(np.abs(new.departure_mps2), np.abs(old.departure_mps2))
-    now = np.mean(np.abs(new.departure_mps2))
-    before = np.mean(np.abs(old.departure_mps2))
+    now_mps2 = np.abs(new.departure_mps2)
+    before_mps2 = np.abs(old.departure_mps2)
+    low, high = _change(now_mps2, before_mps2)
     text = (
-        f'length of gravity off by {mg(now):.3g} mg, before {mg(before):.3g} mg: change '
+        f'length of gravity off by {mg(now_mps2.mean()):.3g} mg, before '
+        f'{mg(before_mps2.mean()):.3g} mg: change '
         f'{mg(low):.3g} to {mg(high):.3g} mg'
     )
     return Outcome('zero-g', low > 0, text, (low, high), 'm/s^2')

@@ -15,17 +15,17 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, TINY
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, number
-from adxl_ros.signals.reading_units import AXIS_UNITS, ReadingUnit, UNITS
+from adxl_ros.signals.reading_units import AXIS_UNITS, READING_UNITS, ReadingUnit
 from adxl_ros.signals.tolerances import calibrated_tolerance, nominal_tolerance, Tolerance
+from adxl_ros.wording import option
 import numpy as np
 
 _NOISE_STDS = 5.0  # Largest error of a mean by noise, in its standard deviations
@@ -71,13 +71,10 @@ class RestReadings:
         return np.linalg.norm(self.mean_mps2, axis=1)
 
     @property
-    def poses(self) -> int:
-        """Whether the rests have one direction or more: 0, 1 or 2."""
-        length = np.maximum(self.length_mps2, TINY)
-        directions = self.mean_mps2 / length[:, None]
-        if not len(directions):
-            return 0
-        return 1 + bool((directions @ directions[0] < TURNED_COS).any())
+    def has_several_poses(self) -> bool:
+        """Whether one of the rests has another direction than the first."""
+        directions = self.mean_mps2 / np.maximum(self.length_mps2, TINY)[:, None]
+        return bool((directions @ directions[0] < TURNED_COS).any())
 
     def divided(self, factors: np.ndarray | float) -> RestReadings:
         """Return the readings divided by a factor, or by one for each axis."""
@@ -210,9 +207,10 @@ def look(
         return GravityAtRest(0, axes, gravity_mps2)
     length = readings.length_mps2
     case = _Case(readings, tolerance, gravity_mps2)
-    # A reading of the length g in these poses is that of a force between these lengths.
-    upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
-    low, high = np.median(replace(case, readings=upright).force_limits(), axis=1)
+    # Readings of the length g in these directions are those of forces from `low` to `high`. By
+    # proportion, a force of the length g gives readings from g·g/high to g·g/low.
+    of_length_g = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
+    low, high = np.median(replace(case, readings=of_length_g).force_limits(), axis=1)
     return GravityAtRest(
         rests=count * every,
         axes=axes,
@@ -226,6 +224,13 @@ def look(
         ),
         fault=case.fault(),
     )
+
+
+class _ForceLimits(NamedTuple):
+    """Smallest and largest length of the force of each rest, m/s², (k,)."""
+
+    low: np.ndarray
+    high: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -242,23 +247,23 @@ class _Case:
         noise_mps2 = np.linalg.norm(self.readings.std_mps2, axis=1)
         return self.tolerance.across * self.gravity_mps2 + _LOCAL_MPS2 + _NOISE_STDS * noise_mps2
 
-    def force_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smallest and largest length of the force of each rest, m/s², (k,) each."""
+    def force_limits(self) -> _ForceLimits:
+        """Return between which lengths the force of each rest is."""
         size = np.abs(self.readings.mean_mps2)
         zero_g = self.tolerance.zero_g_mps2
         scale = self.tolerance.scale
         low = np.linalg.norm(np.maximum(size - zero_g, 0) / (1 + scale), axis=1)
         high = np.linalg.norm((size + zero_g) / (1 - scale), axis=1)
-        return low - self.error_mps2, high + self.error_mps2
+        return _ForceLimits(low - self.error_mps2, high + self.error_mps2)
 
     def too_long(self) -> np.ndarray:
         """Return which rests, taken alone, are longer than a sound sensor reads, (k,)."""
-        return self.force_limits()[0] > self.gravity_mps2
+        return self.force_limits().low > self.gravity_mps2
 
     def too_short(self) -> np.ndarray:
         """Return which rests, taken alone, are shorter; none with less than three axes, (k,)."""
         is_whole = self.readings.mean_mps2.shape[1] == len(AXES)
-        return is_whole & (self.force_limits()[1] < self.gravity_mps2)
+        return is_whole & (self.force_limits().high < self.gravity_mps2)
 
     def is_allowed(self) -> bool:
         """Return whether most rests, each taken alone, may be those of a sound sensor."""
@@ -282,7 +287,7 @@ class _Case:
     def _sphere_middle_mps2(self, prior: float) -> np.ndarray:
         """Return the middle of the sphere nearest to the readings, near 0 by a prior, (m,)."""
         mean = self.readings.mean_mps2
-        axes = self.readings.mean_mps2.shape[1]
+        axes = mean.shape[1]
         # |r|² = 2·r·b + (|f|² − |b|²) is linear in b and in the bracket.
         scale_mps2 = prior * 2 * self.gravity_mps2 * self.error_mps2.mean()
         near_0 = np.diag(scale_mps2 / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2))
@@ -371,17 +376,16 @@ class _Case:
         """Return the unit of all axes in which the readings are gravity."""
         length = float(np.median(self.readings.length_mps2))
         distances = {
-            unit: abs(float(np.log(length / unit.gravity))) for unit in UNITS if self._fits(unit)
+            unit: abs(float(np.log(length / unit.gravity)))
+            for unit in READING_UNITS
+            if self._fits(unit)
         }
         if not distances:
             return None
         # A sensor within the usual tolerance may be nearer to another unit than to its own.
         farthest = min(distances.values()) + _ALIKE
-        likely = [
-            unit
-            for unit in sorted(distances, key=lambda unit: distances[unit])
-            if distances[unit] < farthest
-        ][:2]
+        nearest = sorted(distances, key=distances.__getitem__)[:2]
+        likely = [unit for unit in nearest if distances[unit] < farthest]
         names = ' or '.join(unit.name for unit in likely)
         remedies = ', or '.join(unit.remedy for unit in likely)
         return GravityFault(
@@ -415,7 +419,7 @@ class _Case:
         """Return the units of single axes in which the rests of several poses are gravity."""
         axes = self.readings.mean_mps2.shape[1]
         is_told = self.tolerance.zero_g_mps2.max() < self.gravity_mps2 / 2
-        has_length = self.readings.poses > 1 and axes == len(AXES)
+        has_length = self.readings.has_several_poses and axes == len(AXES)
         if not (is_told and has_length):
             return None
         length = max(float(np.median(self.readings.length_mps2)), _LEAST_MPS2)
@@ -424,20 +428,18 @@ class _Case:
         factors = {'m/s²': 1.0} | {
             unit.name: unit.gravity / self.gravity_mps2 for unit in AXIS_UNITS
         }
-        best = None
-        least = np.inf
+        departures_mps2: dict[tuple[str, ...], float] = {}
         for names in product(factors, repeat=axes):
             if len(set(names)) == 1:
                 continue
             case = self.divided(np.array([factors[name] for name in names]))
             if not case.is_allowed() or case.contradicting().any():
                 continue
-            departure = float(np.abs(case.readings.length_mps2 - self.gravity_mps2).max())
-            if departure < least:
-                best = names
-                least = departure
-        if best is None:
+            departure_mps2 = np.abs(case.readings.length_mps2 - self.gravity_mps2)
+            departures_mps2[names] = float(departure_mps2.max())
+        if not departures_mps2:
             return None
+        best = min(departures_mps2, key=departures_mps2.__getitem__)
         stated = ', '.join(f'{axis} in {name}' for axis, name in zip(AXES, best))
         return GravityFault(
             GravityFaultKind.MIXED_UNITS,

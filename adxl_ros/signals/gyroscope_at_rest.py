@@ -114,11 +114,11 @@ def _divided(rests: Sequence[RestTurns]) -> list[RestTurns]:
     if not rests:
         return []
     count = ceil(_FEWEST_PARTS / len(rests))
-    parts = []
+    parts: list[RestTurns] = []
     for rest in rests:
         number = max(min(count, len(rest.gyro_radps) // _FEWEST_SAMPLES), 1)
         pieces = (np.array_split(values, number) for values in rest)
-        parts += [RestTurns(*piece) for piece in zip(*pieces)]
+        parts += map(RestTurns, *pieces)
     return parts
 
 

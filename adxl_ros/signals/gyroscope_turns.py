@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import AXES
-from adxl_ros.process import option
 from adxl_ros.signals.rest_search import Rest
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 
@@ -203,28 +203,27 @@ def _disagreement(turns: Sequence[_Turn]) -> tuple[float, list[str]]:
     error = float(2 * np.arcsin(min(as_stated / 2, 1.0)))
     if as_stated < _WRONG * size:
         return error, []
-    best = ways[int((errors <= _EQUAL * errors.min()).argmax())]
+    least = errors.min()
+    least_deg = np.degrees(2 * np.arcsin(least / 2))
+    best = ways[int((errors <= _EQUAL * least).argmax())]
     compared = (
         f'over {len(turns)} turns between rests it misses the direction of gravity by '
         f'{np.degrees(error):.0f}° rms'
     )
-    if errors.min() > _BETTER * as_stated:
+    if least > _BETTER * as_stated:
         return error, [
             f'the gyroscope does not follow the accelerometer: {compared}; check its scale '
             'factor and range, and that both are of one sensor, at one time'
         ]
     if best.is_degrees and not best.changes:
         return error, [
-            f'the gyroscope is in °/s: {compared}, and as °/s by '
-            f'{np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}°; state '
-            f'dps by {option("columns")}, or '
-            'convert it to rad/s'
+            f'the gyroscope is in °/s: {compared}, and as °/s by {least_deg:.0f}°; state dps by '
+            f'{option("columns")}, or convert it to rad/s'
         ]
     unit = ' in °/s' if best.is_degrees else ''
     return error, [
         f'the gyroscope has its axes or signs against those of the accelerometer: {compared}, '
-        f'and by {np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}° if the rotation about '
-        f'{best.text}{unit}; correct the driver'
+        f'and by {least_deg:.0f}° if the rotation about {best.text}{unit}; correct the driver'
     ]
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, TINY
-from adxl_ros.process import usage
+from adxl_ros.wording import usage
 import numpy as np
 from scipy.special import erfc
 

@@ -14,13 +14,13 @@ from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.report.figures import AXIS_COLOURS, new_figure
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals.allan_deviation import StillStretch
 from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise
 from adxl_ros.signals.reading_units import AXIS_UNITS
+from adxl_ros.wording import option
 import numpy as np
 import yaml
 

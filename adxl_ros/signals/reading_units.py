@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.process import option
+from adxl_ros.wording import option
 
 _COUNTS_PER_G = [2**k for k in range(6, 19)]
 """Counts of 1 g of digital sensors: from 6 bits of ±2 g to 20 bits of ±2 g, by powers of two."""
@@ -36,7 +36,7 @@ class ReadingUnit:
         return self.conversion or f'state it by {option(**self.options)}'
 
 
-UNITS = (
+READING_UNITS = (
     ReadingUnit('g', 1.0, options={'unit': 'g'}),
     ReadingUnit('mg', 1e3, options={'unit': 'mg'}),
     ReadingUnit('mm/s²', 1e3 * G0_MPS2, options={'unit': 'mmps2'}),
@@ -53,5 +53,6 @@ UNITS = (
     ),
 )
 """Units in which readings may be, those of physics before counts."""
-AXIS_UNITS = [unit for unit in UNITS if unit.name in ('g', 'mg', 'mm/s²', 'm/s² divided by 1000')]
+_OF_AXES = ('g', 'mg', 'mm/s²', 'm/s² divided by 1000')
+AXIS_UNITS = [unit for unit in READING_UNITS if unit.name in _OF_AXES]
 """Units that single axes are tried in. Counts are left out: one of them fits almost any length."""

@@ -15,10 +15,10 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.sensor import Sensor, to_volts, with_axes
-from adxl_ros.process import usage
 from adxl_ros.signals import block_statistics as stats
 from adxl_ros.signals.block_statistics import Spans
 from adxl_ros.signals.filter_noise import estimate_filter
+from adxl_ros.wording import usage
 import numpy as np
 
 SHORTEST_S = 2.0  # Shortest time that shows noise, s. Chosen: some windows of 0.25 s

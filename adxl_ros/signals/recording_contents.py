@@ -15,7 +15,6 @@ from adxl_ros.files.stamp_check import BadStamps
 from adxl_ros.files.stamps import burst_samples, lacks_samples, mean_period_s
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.process import option
 from adxl_ros.signals.allan_deviation import longest_of
 from adxl_ros.signals.axis_ranges import axis_faults, AxisLook, AxisRange
 from adxl_ros.signals.gravity_at_rest import GravityAtRest
@@ -23,6 +22,7 @@ from adxl_ros.signals.gyroscope_turns import GyroFindings, GyroLook
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.rest_search import Rest
 from adxl_ros.signals.stage_angles import StageReadings
+from adxl_ros.wording import option
 import numpy as np
 
 _SAME_POSE_G = 0.1  # Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt

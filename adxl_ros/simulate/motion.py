@@ -14,8 +14,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components, Need
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
 from adxl_ros.simulate.smoothed_path import PathErrors
+from adxl_ros.wording import option
 import numpy as np
 import scipy
 
@@ -54,9 +54,10 @@ class Pieces:
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return a derivative; see `Path`."""
-        values = self._orders[order](np.clip(time_s, self._begin_s, self._end_s))
-        if order and len(time_s) and (time_s[0] < self._begin_s or time_s[-1] > self._end_s):
-            values[(time_s < self._begin_s) | (time_s > self._end_s)] = 0.0
+        within_s = np.clip(time_s, self._begin_s, self._end_s)
+        values = self._orders[order](within_s)
+        if order:
+            values[within_s != time_s] = 0.0
         return values
 
 

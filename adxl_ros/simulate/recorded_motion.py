@@ -12,9 +12,9 @@ from adxl_ros.files.stamps import stamped_rate_hz
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import usage
 from adxl_ros.simulate.motion import ForcePath, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.smoothed_path import BAND_LIMITED_DEGREE, rounding_step, SmoothedPath
+from adxl_ros.wording import usage
 import numpy as np
 
 _ROUNDING_OF_NOISE = 0.1

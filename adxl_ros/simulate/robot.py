@@ -24,10 +24,10 @@ from adxl_ros.files.stamps import mean_period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
 from adxl_ros.model.error_sizes import rms
-from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.smoothed_path import KNOT_S, noise_step, PathErrors, SmoothedPath
+from adxl_ros.wording import option
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d

@@ -80,31 +80,31 @@ class _Knot(NamedTuple):
 class Script:
     """Builds the paths of both angles, move by move."""
 
-    # alpha, beta: Angles at present, rad
-    alpha: float
-    beta: float
-    now: float = 0.0  # Time at present, s
+    # Angles at present, rad
+    alpha_rad: float
+    beta_rad: float
+    now_s: float = 0.0  # Time at present, s
     slew_rad_s: float = SLEW_RAD_S  # Largest velocity of a move to a pose, rad/s
     knots: list[_Knot] = field(default_factory=list)
 
     def rest(self, seconds: float) -> None:
         """Rest for a time, s."""
         self._knot()
-        self.now += seconds
+        self.now_s += seconds
         self._knot()
 
     def go(self, alpha: float, beta: float) -> None:
         """Move to a pose by minimum jerk, whose velocity peaks at the slew rate."""
-        distance = max(abs(alpha - self.alpha), abs(beta - self.beta))
+        distance = max(abs(alpha - self.alpha_rad), abs(beta - self.beta_rad))
         self._knot()
-        self.now += _JERK_PEAK * distance / self.slew_rad_s
-        self.alpha = alpha
-        self.beta = beta
+        self.now_s += _JERK_PEAK * distance / self.slew_rad_s
+        self.alpha_rad = alpha
+        self.beta_rad = beta
         self._knot()
 
     def run(self, joint: str, to: float, speed: float) -> None:
         """Turn one joint to an angle at a constant speed, between a run-up and a stop."""
-        distance = to - (self.alpha if joint == 'alpha' else self.beta)
+        distance = to - (self.alpha_rad if joint == 'alpha' else self.beta_rad)
         rate = np.copysign(speed, distance)
         run_up = rate * RUN_UP_S / 2
         constant = distance - 2 * run_up
@@ -115,26 +115,25 @@ class Script:
 
     def joints(self) -> tuple[Knots, Knots]:
         """Return the paths of alpha and beta."""
-        knots = self.knots
-        time_s = [knot.time_s for knot in knots]
-        return (
-            Knots(time_s, [k.alpha_rad for k in knots], [k.alpha_rad_s for k in knots]),
-            Knots(time_s, [k.beta_rad for k in knots], [k.beta_rad_s for k in knots]),
-        )
+        time_s, alpha_rad, beta_rad, alpha_rad_s, beta_rad_s = np.transpose(self.knots)
+        return Knots(time_s, alpha_rad, alpha_rad_s), Knots(time_s, beta_rad, beta_rad_s)
 
     def _turn(self, joint: str, angle_rad: float, seconds: float, end_rad_s: float) -> None:
         """Turn one joint by an angle, with a rate at the end."""
-        self.now += seconds
+        self.now_s += seconds
         if joint == 'alpha':
-            self.alpha += angle_rad
+            self.alpha_rad += angle_rad
             self._knot(alpha_rad_s=end_rad_s)
         else:
-            self.beta += angle_rad
+            self.beta_rad += angle_rad
             self._knot(beta_rad_s=end_rad_s)
 
     def _knot(self, alpha_rad_s: float = 0.0, beta_rad_s: float = 0.0) -> None:
-        if not self.knots or self.now - self.knots[-1].time_s > _SAME_TIME_S:
-            self.knots.append(_Knot(self.now, self.alpha, self.beta, alpha_rad_s, beta_rad_s))
+        """Add a knot at the present pose, unless there is one at this time."""
+        if not self.knots or self.now_s - self.knots[-1].time_s > _SAME_TIME_S:
+            self.knots.append(
+                _Knot(self.now_s, self.alpha_rad, self.beta_rad, alpha_rad_s, beta_rad_s)
+            )
 
 
 def _visit(poses_deg: Sequence[tuple[float, float]]) -> Motion:
@@ -144,7 +143,7 @@ def _visit(poses_deg: Sequence[tuple[float, float]]) -> Motion:
     for pose in poses_rad:
         script.go(*pose)
         script.rest(DWELL_S + SETTLE_S)
-    return Motion(script.now, *script.joints())
+    return Motion(script.now_s, *script.joints())
 
 
 def sweep(_: np.random.Generator) -> Motion:
@@ -188,7 +187,7 @@ def shaker(_: np.random.Generator) -> Motion:
         script.go(np.pi / 2, beta)
         shakes.append(_shake(script))
     return Motion(
-        script.now,
+        script.now_s,
         *script.joints(),
         lambda time_s, order=0: np.sum([shake(time_s, order) for shake in shakes], axis=0),
     )
@@ -237,7 +236,7 @@ def rich(_: np.random.Generator) -> Motion:
     script.go(np.radians(60), np.radians(45))
     for amplitude in np.radians([20, 10, 5]):
         for joint in ('beta', 'alpha'):
-            middle = script.alpha if joint == 'alpha' else script.beta
+            middle = script.alpha_rad if joint == 'alpha' else script.beta_rad
             for to in (middle + amplitude, middle - amplitude, middle):
                 script.run(joint, to, amplitude / 2)
             script.rest(1.0)
@@ -246,7 +245,7 @@ def rich(_: np.random.Generator) -> Motion:
     for alpha, beta in np.radians([(0, 0), (90, 90), (180, 90), (90, 270), (90, 180), (30, 30)]):
         script.go(alpha, beta)
         script.rest(DWELL_S)
-    end = script.now
+    end = script.now_s
     temperature_c = Steps(
         NOMINAL_TEMPERATURE_C, ((0.25 * end, 35.0), (0.6 * end, NOMINAL_TEMPERATURE_C)), 30.0
     )
@@ -257,7 +256,7 @@ def rich(_: np.random.Generator) -> Motion:
 def _shake(script: Script) -> Pieces:
     """Rest while the shaker runs, and return its path."""
     script.rest(2.0)
-    begin_s = script.now
+    begin_s = script.now_s
     script.rest(_SHAKE_S + 2.0)
     return swept_sine(begin_s)
 

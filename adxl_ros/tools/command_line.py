@@ -20,9 +20,10 @@ from adxl_ros.files.atomic_write import AnyPath, require_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
-from adxl_ros.process import ended_by_closed_output, option, options_named, READING
+from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.arguments import require_least
 from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser, wrapped
+from adxl_ros.wording import option, options_named, READING
 
 if TYPE_CHECKING:
     from adxl_ros.api.sensors import EffectInput

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 from adxl_ros.api.recordings import read_ideal
 from adxl_ros.api.sensors import sensor_of
-from adxl_ros.diagnose.comparison import noiseless
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
@@ -24,6 +23,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import (
     fitted_of,
     get,
+    noiseless,
     parameter_of,
     put,
     Sensor,

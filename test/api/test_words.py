@@ -14,7 +14,7 @@ import subprocess
 import sys
 
 import adxl_ros as adxl
-from adxl_ros.process import option, options_named, pasted, usage
+from adxl_ros.wording import option, options_named, pasted, usage
 from adxl_ros.workers import open_pool
 import numpy as np
 import pytest

@@ -5,9 +5,14 @@
 from dataclasses import replace
 
 from adxl_ros.diagnose import comparison as beside
+from adxl_ros.diagnose.encoder_checks import seen_step_rad
+from adxl_ros.diagnose.fast_motion import fading_frequency_hz
+from adxl_ros.diagnose.reference_gaps import stated_poses, without_gaps
+from adxl_ros.diagnose.sample_faults import code_step_v
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import specific_force
+from adxl_ros.signals.block_statistics import bridged
 from adxl_ros.simulate.motion import ForcePath, Motion
 from gaps import simulated, turning, unit
 import numpy as np
@@ -82,7 +87,7 @@ def test_a_sample_has_one_reason(compared):
 def test_gaps_are_bridged_by_lines_and_ends_hold():
     data = np.array([[9.0], [1.0], [9.0], [9.0], [4.0], [9.0]])
     used = np.array([False, True, False, False, True, False])
-    assert beside.bridged(data, used).ravel() == pytest.approx([1, 1, 2, 3, 4, 4])
+    assert bridged(data, used).ravel() == pytest.approx([1, 1, 2, 3, 4, 4])
 
 
 def test_the_direction_of_the_last_move_stays():
@@ -100,7 +105,7 @@ def test_any_joint_ends_a_rest():
 
 def test_the_step_of_the_codes_is_the_smallest_change():
     volts = np.array([[0.0, 1.0], [0.5, 1.0], [0.25, 1.0], [0.25, 1.0]])
-    assert beside.code_step_v(volts).tolist() == [0.25, 0.0]
+    assert code_step_v(volts).tolist() == [0.25, 0.0]
 
 
 @pytest.mark.parametrize('step_rad', [2e-3, 8e-3])
@@ -114,9 +119,9 @@ def test_the_step_of_an_encoder_shows_in_its_readings(step_rad):
         'beta_rad': np.zeros(4000),
     }
     recording = Recording('made', np.arange(4000) / RATE_HZ, columns)
-    assert beside.seen_step_rad(recording, sensor) == pytest.approx(step_rad, rel=1e-6)
+    assert seen_step_rad(recording, sensor) == pytest.approx(step_rad, rel=1e-6)
     columns['alpha_rad'] = angle_rad
-    assert beside.seen_step_rad(recording, sensor) == sensor.stage_resolution_rad
+    assert seen_step_rad(recording, sensor) == sensor.stage_resolution_rad
 
 
 def test_samples_in_a_gap_of_a_simulator_are_left_out():
@@ -125,7 +130,7 @@ def test_samples_in_a_gap_of_a_simulator_are_left_out():
     time_s = comparison.time_s
     read = (time_s < 10.0) | (time_s > 12.0)
     motion = replace(comparison.motion, force=ForcePath(time_s[read], force_mps2[read]))
-    kept = beside.without_gaps(replace(comparison, motion=motion))
+    kept = without_gaps(replace(comparison, motion=motion))
     unknown_s = time_s[comparison.used & ~kept.used]
     # The spline is uncertain before the gap, and the filter settles after it.
     assert 9.8 < unknown_s.min() < 10.0
@@ -143,7 +148,7 @@ def test_a_pose_that_is_stated_at_rests_alone_holds_there():
     moving_g = np.sin(20.0 * time_s)[:, None] * ~resting[:, None]
     volts = (force + moving_g) * sensor.scale_v_per_g + sensor.zero_g_v
     columns = dict(zip(('x_v', 'y_v', 'alpha_rad', 'beta_rad'), [*volts.T, *stated_rad]))
-    read, left_out = beside.stated_poses(Recording('made', time_s, columns), sensor)
+    read, left_out = stated_poses(Recording('made', time_s, columns), sensor)
     unknown = left_out[0][0] | left_out[1][0]
     assert unknown[~resting].all() and unknown[resting].mean() < 0.15
     comparison = beside.compare(read, sensor)
@@ -161,6 +166,6 @@ def test_a_smooth_reference_fades_at_its_corner(corner_hz):
     white_mps2 = np.random.default_rng(2).normal(0, 3.0, (6000, 3))
     motion_mps2 = low_passed(white_mps2, 30.0) + [0.0, 0.0, G0_MPS2]
     smooth_mps2 = low_passed(motion_mps2, corner_hz)
-    fading_hz = beside.fading_frequency_hz(followed(smooth_mps2, motion_mps2))
+    fading_hz = fading_frequency_hz(followed(smooth_mps2, motion_mps2))
     assert fading_hz == pytest.approx(corner_hz, abs=3.0)
-    assert beside.fading_frequency_hz(followed(motion_mps2, motion_mps2)) is None
+    assert fading_frequency_hz(followed(motion_mps2, motion_mps2)) is None

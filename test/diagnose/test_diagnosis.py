@@ -7,13 +7,13 @@ from functools import cache
 import json
 
 from adxl_ros.diagnose.diagnosis import diagnose
-from adxl_ros.diagnose.next_experiment import propose_next_experiment
+from adxl_ros.diagnose.next_experiment import MENU, propose_next_experiment
 from adxl_ros.diagnose.report_json import as_json
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Need
+from adxl_ros.model.effects.base import Manoeuvre, Need
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from gaps import simulated, turning, unit, warm
@@ -289,8 +289,22 @@ def test_next_experiment_separates_most():
     )
     proposal = propose_next_experiment(verdict, [], sensor, None, 0)
     worth = {m.name: m.per_minute for m in proposal.menu}
-    assert max(worth.values()) == worth[proposal.manoeuvre] > 0
-    assert worth['shake along x from 2 to 40 Hz'] < 0.1 * worth['dwell, heat and cool']
+    best = proposal.menu[0]
+    assert MENU[Manoeuvre[best.name]].text == proposal.manoeuvre
+    assert max(worth.values()) == best.per_minute > 0
+    assert worth['SHAKE'] < 0.1 * worth['HEAT']
+
+
+def test_a_baseline_that_no_stage_can_move_gets_a_manoeuvre_without_a_menu():
+    """The zero of a robot's joint is no effect of a stage, which could simulate nothing."""
+    rivals = ('temperature_bias', 'supply')
+    verdict = replace(
+        diagnosed()[0].report.verdict, status='inseparable', effects=(), groups=(rivals,)
+    )
+    robot = with_effects(unit(), ['joint_offset:joint1_rad=0.01'])
+    proposal = propose_next_experiment(verdict, [], robot, None, 0)
+    assert proposal.manoeuvre == MENU[Manoeuvre.HEAT].text
+    assert (proposal.why, proposal.menu) == ('to separate temperature_bias and supply', ())
 
 
 def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_path, shared_dir):

@@ -4,8 +4,8 @@
 
 from dataclasses import replace
 
-from adxl_ros.diagnose import noise_effects
-from adxl_ros.diagnose.noise_effects import NoiseRemainder
+from adxl_ros.diagnose import noise_effects, noise_remainders, sample_faults
+from adxl_ros.diagnose.noise_remainders import NoiseRemainder
 from adxl_ros.model import noise
 import numpy as np
 import pytest
@@ -29,14 +29,14 @@ def white_v(std_v=1e-3, seed=1):
 def test_the_allan_deviation_of_white_noise_falls_with_the_root():
     noise_v = np.random.default_rng(1).normal(size=(200_000, 1))
     for count in (1, 4, 100):
-        deviation = noise_effects.allan_deviation(noise_v, count)
+        deviation = noise_remainders.allan_deviation(noise_v, count)
         assert deviation == pytest.approx(count**-0.5, rel=0.05)
 
 
 def test_the_allan_deviation_of_a_ramp_is_its_rise_over_the_root_of_two():
     ramp_v = 0.3 * np.arange(1000.0)[:, None]
     for count in (1, 10, 100):
-        assert noise_effects.allan_deviation(ramp_v, count) == pytest.approx(
+        assert noise_remainders.allan_deviation(ramp_v, count) == pytest.approx(
             0.3 * count / np.sqrt(2)
         )
 
@@ -72,7 +72,7 @@ def test_long_runs_of_equal_samples_are_repeats():
     volts = white_v()
     volts[1001:1021] = volts[1000]
     volts[3001] = volts[3000]
-    used, found = noise_effects.repeated_samples(volts, TIME_S, np.ones(COUNT, bool), sensor())
+    used, found = sample_faults.repeated_samples(volts, TIME_S, np.ones(COUNT, bool), sensor())
     assert np.flatnonzero(~used).tolist() == list(range(1001, 1021))
     (repeats,) = found
     assert repeats.effect == 'stuck'
@@ -89,7 +89,7 @@ def test_a_short_hold_in_fast_motion_is_no_spike():
         volts[start : start + 4] = volts[start]
     alone = np.zeros(COUNT, bool)
     alone[starts + 3] = True
-    _, (found,) = noise_effects.repeated_samples(
+    _, (found,) = sample_faults.repeated_samples(
         volts[:, :1], TIME_S, np.ones(COUNT, bool), sensor(axes='x'), alone
     )
     assert found.effect == 'stuck'
@@ -99,16 +99,16 @@ def test_a_short_hold_in_fast_motion_is_no_spike():
 def test_a_run_of_equal_codes_may_be_chance():
     """One axis that repeats in half of its samples repeats 30 times in 10⁵ samples."""
     coarse_v = np.random.default_rng(1).integers(0, 2, (100_000, 1)).astype(float)
-    assert 25 < noise_effects.shortest_repeat(coarse_v, 1) <= 100
+    assert 25 < sample_faults.shortest_repeat(coarse_v, 1) <= 100
     fine_v = np.random.default_rng(1).normal(size=(100_000, 3))
-    assert noise_effects.shortest_repeat(fine_v, 3) <= 4
+    assert sample_faults.shortest_repeat(fine_v, 3) <= 4
 
 
 def test_spikes_are_counted_with_their_size():
     volts = white_v()
     spikes = np.arange(200, COUNT, 400)
     volts[spikes, 0] += 0.5
-    used, found = noise_effects.isolated_samples(
+    used, found = sample_faults.isolated_samples(
         volts, volts, TIME_S, np.ones(COUNT, bool), sensor()
     )
     assert np.flatnonzero(~used).tolist() == spikes.tolist()
@@ -121,26 +121,26 @@ def test_spikes_are_counted_with_their_size():
 def test_a_step_is_no_spike():
     volts = white_v()
     volts[COUNT // 2 :] += 0.5
-    used, found = noise_effects.isolated_samples(
+    used, found = sample_faults.isolated_samples(
         volts, volts, TIME_S, np.ones(COUNT, bool), sensor()
     )
-    assert (used.all(), found) == (True, [])
+    assert (used.all(), found) == (True, ())
 
 
 @pytest.mark.filterwarnings('error')
 def test_where_nothing_is_compared_no_sample_stands_alone():
     none = np.zeros(COUNT, bool)
-    used, found = noise_effects.isolated_samples(white_v(), white_v(), TIME_S, none, sensor())
-    assert (used.any(), found) == (False, [])
+    used, found = sample_faults.isolated_samples(white_v(), white_v(), TIME_S, none, sensor())
+    assert (used.any(), found) == (False, ())
 
 
 def test_spikes_of_the_residual_alone_are_of_the_reference():
     residual_v = white_v()
     residual_v[200::400] += 0.5
-    used, found = noise_effects.isolated_samples(
+    used, found = sample_faults.isolated_samples(
         white_v(seed=2), residual_v, TIME_S, np.ones(COUNT, bool), sensor()
     )
-    assert (used.all(), found) == (True, [])
+    assert (used.all(), found) == (True, ())
 
 
 @pytest.mark.parametrize('bits', [1, 3])
@@ -148,7 +148,7 @@ def test_coarse_codes_show_the_lost_bits(bits):
     made = sensor(adc_bits=16)
     step_v = made.lsb_v * 2**bits
     volts = np.rint(white_v(20 * step_v) / step_v) * step_v
-    found = noise_effects.coarse_codes(volts, made)
+    found = sample_faults.coarse_codes(volts, made)
     assert found.values['lost_bits'] == pytest.approx(bits)
     assert noise.electronics(found.added_to(made)).lsb_v == pytest.approx(step_v)
 
@@ -157,27 +157,27 @@ def test_bits_that_one_axis_has_lost_are_its_own():
     made = sensor(adc_bits=16)
     volts = white_v(100 * made.lsb_v)
     steps_v = made.lsb_v * np.array([1.0, 4.0])
-    found = noise_effects.coarse_codes(np.rint(volts / steps_v) * steps_v, made)
+    found = sample_faults.coarse_codes(np.rint(volts / steps_v) * steps_v, made)
     assert found.values['lost_bits'] == 0.0
     assert found.values['axis_lost_bits'] == pytest.approx([0.0, 2.0])
     assert noise.electronics(found.added_to(made)).lsb_v == pytest.approx(steps_v)
-    assert noise_effects.coarse_codes(np.rint(volts / made.lsb_v) * made.lsb_v, made) is None
+    assert sample_faults.coarse_codes(np.rint(volts / made.lsb_v) * made.lsb_v, made) is None
 
 
 def test_the_floor_is_without_lines_and_excess_noise():
     """A line of amplitude a adds a²/2, and excess noise what exceeds the stated noise."""
     hum = NoiseRemainder('mains_hum', 'line', 'm/s^2', 'x', 0.4, 0.4, 0.4**2)
     excess = NoiseRemainder('noise_excess', 'white noise', 'm/s^2', 'x', 0.5, 0.5, 0.5**2)
-    assert noise_effects.floor_without(1.0, [hum], 0.3) == pytest.approx(np.sqrt(1 - 0.08))
-    assert noise_effects.floor_without(1.0, [excess], 0.3) == pytest.approx(
+    assert noise_remainders.floor_without(1.0, [hum], 0.3) == pytest.approx(np.sqrt(1 - 0.08))
+    assert noise_remainders.floor_without(1.0, [excess], 0.3) == pytest.approx(
         np.sqrt(1 - 0.25 + 0.09)
     )
-    assert noise_effects.floor_without(0.2, [hum], 0.1) == pytest.approx(0.1)
+    assert noise_remainders.floor_without(0.2, [hum], 0.1) == pytest.approx(0.1)
 
 
 def test_a_detection_states_its_mean_square():
     """Codes of twice the step have the variance of rounding to them, step²/12."""
     made = replace(sensor(adc_bits=12), nominal_scale_v_per_g=np.array([1.0, 1.0]))
     step_v = 2 * made.lsb_v
-    found = noise_effects.coarse_codes(np.rint(white_v(20 * step_v) / step_v) * step_v, made)
+    found = sample_faults.coarse_codes(np.rint(white_v(20 * step_v) / step_v) * step_v, made)
     assert found.power_mps2 == pytest.approx((9.80665 * step_v) ** 2 / 12, rel=1e-6)

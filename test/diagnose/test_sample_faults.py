@@ -2,7 +2,7 @@
 
 """Samples that stand alone are found one by one, whatever their size and however near."""
 
-from adxl_ros.diagnose.noise_effects import isolated_samples
+from adxl_ros.diagnose.sample_faults import isolated_samples
 import numpy as np
 import pytest
 from units import nominal

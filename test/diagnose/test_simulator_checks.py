@@ -9,7 +9,7 @@ from adxl_ros.api.recordings import read_ideal
 from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.data_checks import check_gravity, compare_checked
 from adxl_ros.diagnose.data_faults import DataFault
-from adxl_ros.diagnose.noise_effects import sample_faults
+from adxl_ros.diagnose.sample_faults import sample_faults
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.constants import G0_MPS2

@@ -7,6 +7,8 @@ from dataclasses import replace
 from adxl_ros.calibrate.keep.keeper import Keeper
 from adxl_ros.files import parameter_file
 from adxl_ros.files.sweep_journal import Journal, read
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.sensor import to_nominal_mps2
 from adxl_ros_validation.kept_robots import calibrated, Kind, Robot
 from builtin_interfaces.msg import Time
 from graph import Graph, RELIABLE
@@ -16,13 +18,23 @@ from std_srvs.srv import Trigger
 
 UNIT = replace(calibrated(), rate_hz=100.0)
 STEP_NS = 10_000_000
-NOISE_G = 4e-4  # Of a sample, below that of the datasheet
+SAMPLES = 6200  # Those of 62 s: two windows of a rest
+NOISE_MPS2 = 4e-4 * G0_MPS2  # Of a sample, below that of the datasheet
+PARAMS = ('--ros-args', '--params-file', 'unit.yaml')
+KEEPS = (
+    'keep_calibrated',
+    *PARAMS,
+    *('-p', 'output:=kept', '-p', 'store:=store', '-p', 'ramp_s:=2.0'),
+    *RELIABLE,
+)
+"""The node, whose ramp takes two seconds."""
 
 
 def decisive():
     """Return the rests before the first adoption, and the one that leads to it."""
-    robot, taken = Robot(Kind(lies_down=True, slope=5), np.random.default_rng(3)), []
+    robot = Robot(Kind(lies_down=True, slope=5), np.random.default_rng(3))
     keeper = Keeper(UNIT)
+    taken = []
     for day in range(40):
         for rest, _ in robot.rests(day):
             if keeper.add(rest) is not None:
@@ -32,7 +44,7 @@ def decisive():
 
 
 def play(graph, rest):
-    """Publish a rest of 62 s, which fills two windows."""
+    """Publish the samples of a rest."""
     samples = graph.node.create_publisher(Imu, 'imu/data_raw', 10000)
     readings = graph.node.create_publisher(Temperature, 'temperature', 100)
     # Node and compensation take both topics.
@@ -41,9 +53,9 @@ def play(graph, rest):
         20,
         'both subscribers',
     )
-    accel = (np.array(rest.mean_v) - 2.5) * 9.80665
-    noise = np.random.default_rng(1).normal(size=(6200, 3)) * NOISE_G * 9.80665
-    for number, values in enumerate((accel + noise).tolist()):
+    accel_mps2 = to_nominal_mps2(np.array(rest.mean_v), UNIT)
+    noise_mps2 = np.random.default_rng(1).normal(0, NOISE_MPS2, (SAMPLES, 3))
+    for number, values in enumerate((accel_mps2 + noise_mps2).tolist()):
         sec, nanosec = divmod(rest.start_ns + number * STEP_NS, 10**9)
         message = Imu()
         message.header.stamp = Time(sec=sec, nanosec=nanosec)
@@ -57,27 +69,30 @@ def play(graph, rest):
         samples.publish(message)
 
 
+def begin_journal(rests, start, kill, tmp_path):
+    """Let a node that is killed begin the journal, and append rests to it."""
+    node = start(*KEEPS)
+    node.wait_for('keeping K1', 30)
+    kill(node.popen.pid)
+    node.wait()
+    (path,) = (tmp_path / 'kept').rglob('*.jsonl')
+    journal = Journal(path, read(path).head)
+    for rest in rests:
+        journal.append(rest)
+    journal.close()
+
+
 def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, kill, tmp_path):
     parameter_file.save(tmp_path / 'unit.yaml', UNIT)
-    file, kept = ('--ros-args', '--params-file', 'unit.yaml'), ('-p', 'output:=kept')
-    own = (*kept, '-p', 'store:=store', '-p', 'ramp_s:=2.0', *RELIABLE)
-    first = start('keep_calibrated', *file, *own)
-    first.wait_for('keeping K1', 30)
-    kill(first.popen.pid)
-    first.wait()
-    (path,) = (tmp_path / 'kept').rglob('*.jsonl')
-    before, rest = decisive()
-    journal = Journal(path, read(path).head)
-    for each in before:
-        journal.append(each)
-    journal.close()
+    before, last = decisive()
+    begin_journal(before, start, kill, tmp_path)
     # It finds no node that was killed before.
     with Graph() as graph:
-        start('compensation', *file)
-        again = start('keep_calibrated', *file, *own)
-        again.wait_for(f'{len(before)} entries in', 30)
-        play(graph, rest)
-        graph.spin_until(lambda: 'adopted: x' in again.output(), 30, 'the adoption')
+        start('compensation', *PARAMS)
+        node = start(*KEEPS)
+        node.wait_for(f'{len(before)} entries in', 30)
+        play(graph, last)
+        graph.spin_until(lambda: 'adopted: x' in node.output(), 30, 'the adoption')
         (stored,) = (tmp_path / 'store').rglob('*.yaml')
         graph.spin_until(
             lambda: (

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Imports follow the layers, and extras are imported in the functions that use them."""
+"""Imports follow the layers, extras are imported where they are used, folders list their files."""
 
 import ast
 from pathlib import Path
+import re
 import sys
 
 from processes import REPO
@@ -33,6 +34,24 @@ def test_contracts(capsys: pytest.CaptureFixture) -> None:
     )
     status = cli.lint_imports(config_filename=str(REPO / 'pyproject.toml'), no_cache=True)
     assert status == 0, capsys.readouterr().out
+
+
+CHAPTERS = re.compile(r'^    ([\w/]+)  +\S', re.MULTILINE)
+"""A row of the table of chapters in the head of a folder: a module, and what is in it."""
+
+
+@pytest.mark.parametrize(
+    'folder',
+    ['calibrate', 'diagnose', 'files', 'links', 'model', 'nodes', 'signals', 'simulate'],
+)
+def test_the_head_of_a_folder_names_all_its_files_once(folder: str) -> None:
+    head = ast.get_docstring(ast.parse((PACKAGE / folder / '__init__.py').read_text())) or ''
+    modules = [
+        str(path.relative_to(PACKAGE / folder).with_suffix(''))
+        for path in (PACKAGE / folder).rglob('*.py')
+        if path.name != '__init__.py'
+    ]
+    assert sorted(CHAPTERS.findall(head)) == sorted(modules)
 
 
 def imported_at_once(path: Path) -> set[str]:

@@ -15,10 +15,10 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
-from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.sensor import Sensor, to_nominal_mps2, typical
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2, typical, with_neutral
 import numpy as np
 from processes import executable, PATIENCE
 import pytest
@@ -365,3 +365,30 @@ def test_a_temperature_that_ends_is_held_and_said(run_tool: RunTool, tmp_path: P
     np.testing.assert_allclose(force, force[0], atol=1e-9)
     done = run_tool('apply', path, '--params', path.with_name('unit.yaml'), '-o', 'again.csv')
     assert '5000 of 20000' in done.stdout
+
+
+def test_temperature_and_supply_are_corrected(run_tool: RunTool, tmp_path: Path) -> None:
+    effects = ('--effect', 'supply', '--effect', 'temperature_bias:per_k=1e-3')
+    made = run_tool('simulate', 'soak', '--rate', '2', *effects, '-o', 'soak.csv')
+    assert made.returncode == 0, made.stderr
+    sensor = with_neutral(nominal('xy'), ['supply', 'temperature_bias'])
+    sensor = replace(
+        sensor,
+        values={
+            **sensor.values,
+            'supply': typical(library()['supply'], 'xy'),
+            'temperature_bias': {'per_k': np.full(2, 1e-3)},
+        },
+    )
+    parameter_file.save(tmp_path / 'unit.yaml', sensor)
+    done = run_tool('apply', 'soak.csv', '--params', 'unit.yaml', '-o', 'out.csv')
+    assert done.returncode == 0 and not done.stderr
+    ax = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)['ax_mps2']
+    assert np.abs(ax - G * np.sin(np.radians(60)) * np.cos(np.radians(30))).max() < 0.03
+    bare = [
+        ','.join(line.split(',')[:3]) if line[0] != '#' else line
+        for line in (tmp_path / 'soak.csv').read_text().splitlines()
+    ]
+    (tmp_path / 'bare.csv').write_text('\n'.join(bare) + '\n')
+    done = run_tool('apply', 'bare.csv', '--params', 'unit.yaml', '-o', 'out.csv')
+    assert done.returncode == 0 and 'supply_v is not recorded' in done.stdout

@@ -232,13 +232,14 @@ def _decode_info(payload: bytes) -> BoardInfo:
         raise WireError('no info frame')
     _, _, flags, _, rate_hz, bits, channels, vref_v, serial = _INFO.unpack(payload)
     name = serial.rstrip(b'\0')
-    if not (
+    is_within = (
         RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
         and _VREFS_V[0] <= vref_v <= _VREFS_V[1]
         and 1 <= bits <= MAX_BITS
         and 1 <= channels <= MAX_CHANNELS
-        and all(32 <= byte < 127 for byte in name)
-    ):
+    )
+    is_printable = all(32 <= byte < 127 for byte in name)
+    if not (is_within and is_printable):
         raise WireError('an info frame beyond the bounds of the format')
     return BoardInfo(
         rate_hz=rate_hz,
@@ -256,12 +257,9 @@ def _decode_samples(payload: bytes) -> SampleFrame:
     (_, _, flags, sequence, time_us, index, overruns, count, channels) = _SAMPLES.unpack_from(
         payload
     )
-    if (
-        len(payload) != _SAMPLES.size + 2 * count * channels
-        or not count
-        or not 0 < channels <= MAX_CHANNELS
-        or time_us > _MAX_TIME_US
-    ):
+    is_whole = len(payload) == _SAMPLES.size + 2 * count * channels
+    is_within = count and 0 < channels <= MAX_CHANNELS and time_us <= _MAX_TIME_US
+    if not (is_whole and is_within):
         raise WireError('a frame of samples beyond the bounds of the format')
     codes = np.frombuffer(payload, '<u2', offset=_SAMPLES.size).reshape(count, channels)
     return SampleFrame(

@@ -595,12 +595,13 @@ def saturation(signals: Signals, p: Parameters) -> None:
     knee_g = float(p['knee_g'])
     for d, (limit, offset) in enumerate(zip(p['limit_g'], p['offset_g'])):
         x = signals.output[d]
-        upper, lower = limit + offset, limit - offset
+        upper = offset + limit
+        lower = offset - limit
         if not knee_g:
-            signals.output[d] = np.clip(x, -lower, upper)
+            signals.output[d] = np.clip(x, lower, upper)
         else:
             above = np.logaddexp(0.0, (x - upper) / knee_g)
-            below = np.logaddexp(0.0, (-x - lower) / knee_g)
+            below = np.logaddexp(0.0, (lower - x) / knee_g)
             signals.output[d] = x - knee_g * (above - below)
 
 
