@@ -16,11 +16,7 @@ gravity and axes at rest
     reading_units         units in place of m/s²
     gravity_at_rest       the length of gravity, and what explains another one
     polarity              axes that are inverted or swapped
-<<<<<<< HEAD
-    stage_angles          whether the angles of a stage explain the output
-=======
     stage_angles          whether the angles of a stage explain the output, and in which unit
->>>>>>> 5e03408655edd3ee0d780ff9501482eb32768a37
     axis_ranges           axes at the end of their range, or stuck
     neighbouring_samples  repeated, interleaved, wrapped and single wrong samples
     gyroscope_at_rest     the bias of a gyroscope
