@@ -60,8 +60,8 @@ gap = adxl.diagnose(recording(logged_mps2), 'adxl355', sim=recording(simulated_m
 print(gap)
 
 # %% [markdown]
-# The sizes, and what is left of the gap in a simulation that has them. Beside the askew board it finds
-# that filter or delay of the log are not what it assumes at 200 Hz, and does not separate the two.
+# The sizes, and what is left of the gap in a simulation that has them. Beside the askew board, the
+# filter or the delay of the log are not what is assumed at 200 Hz; the two are not separated.
 
 # %%
 for effect in gap.effects:
