@@ -112,18 +112,22 @@ def _cores() -> int:
 
 @contextmanager
 def _without_messages_of_dask() -> Iterator[None]:
-    """Silence Dask for a while: a lost scheduler is reported by this module, in one line."""
+    """
+    Silence Dask for a while: a lost scheduler is reported by this module, in one line.
+
+    After an error it stays silent, because the threads of a lost client go on reporting.
+    """
+    with suppress(ImportError):  # It sets these levels when it loads.
+        import distributed  # noqa: F401
     loggers = list(map(logging.getLogger, _LOGGERS_OF_DASK))
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         warnings.filterwarnings('ignore', 'Sending large graph')
-        try:
-            for logger in loggers:
-                logger.setLevel(logging.CRITICAL)
-            yield
-        finally:
-            for logger, level in zip(loggers, levels):
-                logger.setLevel(level)
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        yield
+    for logger, level in zip(loggers, levels):
+        logger.setLevel(level)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.links import serial as serial_link
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes import topics
+from adxl_ros.nodes import driver as driver_node, topics
 from adxl_ros.nodes.driver import Driver
 from processes import wait_until
 import pytest
@@ -56,7 +56,7 @@ def make_driver(
         return HalfOpen(serial_link.open_link(sensor, settings), setting.failure)
 
     monkeypatch.setattr(
-        base,
+        driver_node,
         'link_module',
         lambda _: SimpleNamespace(Settings=serial_link.Settings, open_link=open_link),
     )
@@ -128,7 +128,7 @@ def test_the_time_in_which_a_node_was_held_up_is_no_silence(
 
     wait_until(received, 10, 'a sample')
     late_s = time.monotonic() + 60
-    monkeypatch.setattr(topics, 'time', SimpleNamespace(monotonic=lambda: late_s))
+    monkeypatch.setattr(base, 'time', SimpleNamespace(monotonic=lambda: late_s))
     while inbox.take():
         pass
     assert inbox.silence() == ''
