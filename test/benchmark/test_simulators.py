@@ -133,12 +133,24 @@ def test_what_a_reset_leaves_is_shown(tmp_path: Path, monkeypatch: pytest.Monkey
     assert re.search(r'm/s² \| [1-9][\d.]* m?g \| < 0.01 mg', page), page
 
 
-def test_mujoco(tmp_path: Path) -> None:
-    """What `mj_step` leaves belongs to the step before."""
+@pytest.fixture(scope='module')
+def after_step(tmp_path_factory: pytest.TempPathFactory) -> Checked:
+    """Return what is found in `sensordata` as `mj_step` leaves it."""
     pytest.importorskip('mujoco')
     path = REPO / 'docs' / 'measurements' / 'simulators' / 'in_mujoco.py'
-    made = checked(runpy.run_path(str(path))['AfterStep'], tmp_path)
-    assert any(named.startswith('time_offset: offset 2.0') for named in made.named)
+    return checked(runpy.run_path(str(path))['AfterStep'], tmp_path_factory.mktemp('mujoco'))
+
+
+@pytest.mark.xfail(
+    strict=True, reason='the integrator, 1.2 mg, is named vibration_rectification before the delay'
+)
+def test_the_delay_of_mujoco_is_the_largest_cause(after_step: Checked) -> None:
+    assert after_step.named[0].startswith('time_offset: offset 2.')
+
+
+def test_mujoco(after_step: Checked) -> None:
+    """What `mj_step` leaves belongs to the step before."""
+    assert any(named.startswith('time_offset: offset 2.0') for named in after_step.named)
     step_ms = 1e3 * arm.STEP_S
     # Its rates belong to the middle of a step.
     for moved, late_ms in {
@@ -146,4 +158,4 @@ def test_mujoco(tmp_path: Path) -> None:
         'acceleration': step_ms,
         'rates': step_ms / 2,
     }.items():
-        assert made.late_ms[moved][0] == pytest.approx(late_ms, abs=0.05)
+        assert after_step.late_ms[moved][0] == pytest.approx(late_ms, abs=0.05)
