@@ -20,6 +20,7 @@ from adxl_ros.calibrate.pose_model import predicted_volts
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model import noise
 from adxl_ros.model.constants import Z_90
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
 from adxl_ros_validation import experiments
 from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
@@ -80,7 +81,7 @@ def draw(
     held_out = _measured(truth, angles, angles, rng), angles
     tilt = experiments.angle_errors(fit.fitted, bound, *held_out)
     force, force_std = experiments.force_errors(fit.fitted, truth, *held_out)
-    bound_std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
+    bound_std = dict(zip(bound.covariance_names, stds(bound.covariance)))
     by_bound = [bound_std[name] for name in names] if set(names) == set(bound_std) else np.nan
     return pd.concat(
         [
@@ -89,7 +90,7 @@ def draw(
                     'of': 'coefficients',
                     'name': list(map(str, names)),
                     'by_bound': error / by_bound,
-                    'z': error / np.sqrt(np.diag(fit.fitted.covariance)),
+                    'z': error / stds(fit.fitted.covariance),
                 }
             ),
             pd.DataFrame({'of': 'tilt', 'z': (tilt.error / tilt['std'])[tilt.counts]}),

@@ -17,6 +17,7 @@ from typing import NamedTuple
 from adxl_ros.diagnose.noise_filters import drifts_among, Whitener, without_pole
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.signals.block_statistics import bridged
 import numpy as np
@@ -161,7 +162,7 @@ class LinearFit:
         The other coefficients are at their conditional maximum.
         """
         count = len(values)
-        std = np.sqrt(np.diag(self.covariance)[:count])
+        std = stds(self.covariance)[:count]
         deviation = (values - self.values[:count]) / std
         correlation = self.covariance[:count, :count] / std / std[:, None]
         return 0.5 * float(
@@ -403,10 +404,10 @@ class LinearisedHypothesis:
         """Return the values of the effects, (j,), of which some are kept or bounded."""
         j = len(self.values)
         names = self.names[:j]
-        std = np.sqrt(np.diag(fit.covariance)[:j])
+        std = stds(fit.covariance)[:j]
         undetermined = std > UNDETERMINED_SHARE * self.prior_std[:j]
         if full_fit is not None:
-            undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
+            undetermined |= std > _UNDETERMINED_RATIO * stds(full_fit.covariance)[:j]
         is_shape = np.array([parameter_of(name).role is Role.SHAPE for name in names], bool)
         is_limit = np.array([bool(effect_named(name.effect).limits) for name in names], bool)
         is_size = np.array([parameter_of(name).is_size for name in names], bool)

@@ -33,6 +33,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern, Manoeuvre
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import Sensor, with_neutral, with_values
 from adxl_ros.process import command
 from adxl_ros.report.quantities import listed
@@ -70,7 +71,7 @@ def expected_information(
     gram: products of the sensitivities, in units of the noise, (k, k).
     """
     weights = np.asarray(probabilities, float)
-    size = np.max([np.abs(b.mean) + np.sqrt(np.diag(b.covariance)) for b in beliefs], axis=0)
+    size = np.max([np.abs(b.mean) + stds(b.covariance) for b in beliefs], axis=0)
     kept = np.flatnonzero(size)
     values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)] * np.outer(size[kept], size[kept]))
     # A root of G, because all sensitivities with the same products respond alike.

@@ -23,7 +23,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, StraightLine
-from adxl_ros.model.error_sizes import rms
+from adxl_ros.model.error_sizes import rms, stds
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, put, Sensor, with_neutral
 import numpy as np
@@ -343,7 +343,7 @@ def _fitted_hypothesis(linear_model: LinearModel, linearised: LinearisedHypothes
     j = len(linearised.values)
     names = linearised.names[:j]
     at_values = linearised.values - linearised.prior_mean[:j]
-    std = np.sqrt(np.diag(fit.covariance)[:j])
+    std = stds(fit.covariance)[:j]
     # Neither the encoder nor the form of an effect is exact.
     in_rad = [parameter_of(n).unit == 'rad' for n in names]
     size = np.where([parameter_of(n).is_size for n in names], fit.values[:j], linearised.values)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from adxl_ros.errors import UserError
+from adxl_ros.model.error_sizes import rms
 import numpy as np
 
 LONGEST_MOVE_NS = 1e8
@@ -93,4 +94,4 @@ class Track:
         value = self._value
         share = (time_ns[1:-1] - time_ns[:-2]) / (time_ns[2:] - time_ns[:-2])
         residual = value[1:-1] - (value[:-2] + share * (value[2:] - value[:-2]))
-        return float(np.sqrt(np.mean(residual**2)))
+        return rms(residual)

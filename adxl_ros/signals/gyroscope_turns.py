@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import AXES
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.signals.rest_search import Rest
 from adxl_ros.wording import option
 import numpy as np
@@ -197,7 +198,7 @@ def _disagreement(turns: Sequence[_Turn]) -> tuple[float, list[str]]:
         predicted = _turned(turn, np.stack([way.matrix for way in ways]))
         squares += np.sum((predicted - turn.after) ** 2, axis=1) / len(turns)
     errors = np.sqrt(squares)
-    size = float(np.sqrt(np.mean([turn.size**2 for turn in turns])))
+    size = rms([turn.size for turn in turns])
     # The ways with the fewest changes come first, and of them those in rad/s: as it should be.
     as_stated = errors[0]
     error = float(2 * np.arcsin(min(as_stated / 2, 1.0)))

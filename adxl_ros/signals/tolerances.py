@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import get, Sensor
 import numpy as np
 
@@ -58,7 +59,7 @@ def _departure(sensor: Sensor, effect: str, parameter: str) -> float:
 
 def calibrated_tolerance(sensor: Sensor) -> Tolerance:
     """Return the tolerance of a calibrated sensor, whose effects are undone."""
-    std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
+    std = dict(zip(sensor.covariance_names, stds(sensor.covariance)))
 
     def fitted(effect: str, parameter: str) -> np.ndarray:
         return _CALIBRATED_STDS * np.array(

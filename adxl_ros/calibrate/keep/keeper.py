@@ -30,7 +30,7 @@ from adxl_ros.files.calibration_store import calibration_id, date_of
 from adxl_ros.files.sweep_journal import Adopted, JournalEntry, NaturalRest, Undone
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.error_sizes import variances_of
+from adxl_ros.model.error_sizes import stds, variances_of
 from adxl_ros.model.sensor import get, put, Sensor
 from adxl_ros.report.quantities import utc
 import numpy as np
@@ -494,7 +494,7 @@ class Keeper:
             zero_g_mg=tuple((1e3 * zero_g).tolist()),
             total_mg=tuple((1e3 * total).tolist()),
             zero_g_90_mg=tuple((1e3 * NORMAL_90 * std).tolist()),
-            error_90_mg=float(1e3 * NORMAL_90 * np.sqrt(np.diag(spread).max())),
+            error_90_mg=float(1e3 * NORMAL_90 * stds(spread).max()),
             tilt_90_deg=float(np.degrees(NORMAL_90 * tilt_rad)),
             determined=self._determined(std**2, unlearnt),
             rests_a_day=dict(Counter(side for _, side in self._newest)),
