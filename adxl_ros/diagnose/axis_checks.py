@@ -139,6 +139,8 @@ def stuck(comparison: BaselineComparison) -> np.ndarray:
     """Return where an axis keeps one value in motion that it should follow, (n, m) bool."""
     volts = comparison.volts
     simulated_v = comparison.simulated_v(comparison.sensor)
+    # Within a code, an output may move by its step.
+    moved_v = SMALLEST_RANGE_V + code_step_v(volts)
     longest = max(round(_LONGEST_HOLD_S * comparison.sensor.rate_hz), 2)
     found = np.zeros(volts.shape, bool)
     for d, (values_v, expected_v) in enumerate(zip(volts.T, simulated_v.T)):
@@ -147,7 +149,7 @@ def stuck(comparison: BaselineComparison) -> np.ndarray:
         held &= (values_v < np.nanmax(values_v)) & (values_v > np.nanmin(values_v))
         for begin, end in true_runs(held & comparison.used):
             is_long = end - begin > longest
-            if is_long and np.ptp(expected_v[begin:end]) > SMALLEST_RANGE_V:
+            if is_long and np.ptp(expected_v[begin:end]) > moved_v[d]:
                 found[begin:end, d] = True
     return found
 

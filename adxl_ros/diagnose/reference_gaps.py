@@ -109,7 +109,8 @@ class _Bridges(NamedTuple):
                 and abs(line[end] - line[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
             )
             if is_inner and (holds or (is_exact and is_long)):
-                values[begin:end] = line[begin:end]
+                # An encoder goes on with its last reading, and not in a line.
+                values[begin:end] = line[begin:end] if is_exact else line[begin - 1]
             if is_long and not holds:
                 unknown |= (time_s > time_s[begin] - _BEFORE_S) & (
                     time_s < time_s[end - 1] + _AFTER_S

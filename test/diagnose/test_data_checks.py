@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from adxl_ros.diagnose.axis_checks import check_axes, check_output, stuck
 from adxl_ros.diagnose.comparison import compare
+from adxl_ros.diagnose.data_checks import compare_checked
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.encoder_checks import check_encoder
 from adxl_ros.diagnose.motion_shifts import correlate, find_drift, find_step, Motions
@@ -183,3 +184,32 @@ def test_an_output_is_stuck_where_it_keeps_a_value_for_more_than_a_second(beside
     volts[2000:2040, 0] = volts[2000, 0]
     rows, axes = np.nonzero(stuck(replace(comparison, volts=volts)))
     assert rows.tolist() == list(range(1001, 1200)) and set(axes) == {1}
+
+
+def test_coarse_codes_are_not_stuck(beside):
+    comparison = beside(lambda g: g)
+    coarse_v = np.round(comparison.volts / 0.3) * 0.3
+    assert not stuck(replace(comparison, volts=coarse_v)).any()
+
+
+def test_a_pose_that_is_read_before_and_after_a_gap_holds_in_it():
+    """As in a table by hand: poses at rest, none in between, and some readings are missing."""
+    sensor = replace(nominal('xyz'), rate_hz=RATE_HZ)
+    rng = np.random.default_rng(1)
+    number = np.arange(len(TIME_S)) // 300
+    moves = np.arange(len(TIME_S)) % 300 < 60
+    poses = rng.uniform([0.3, -2.5], [2.8, 2.5], (10, 2))
+    alpha_rad, beta_rad = (np.interp(TIME_S, TIME_S[~moves], p[number][~moves]) for p in poses.T)
+    force_g = np.column_stack(specific_force(alpha_rad, beta_rad, 1.0))
+    volts = sensor.zero_g_v + sensor.scale_v_per_g * force_g
+    volts += 1e-3 * rng.normal(size=volts.shape)
+    alpha_rad[300 * 3 + 240 :] += 1e-5
+    missing = moves.copy()
+    missing[300 * 3 + 80 : 300 * 3 + 240] = True
+    alpha_rad[missing] = beta_rad[missing] = np.nan
+    columns = {f'{axis}_v': v for axis, v in zip('xyz', volts.T)}
+    recording = recorded(alpha_rad=alpha_rad, beta_rad=beta_rad, **columns)
+    comparison = compare_checked(recording, sensor, None, False)
+    residual_v = comparison.residual_v(sensor)[comparison.used]
+    assert np.std(residual_v, axis=0) == pytest.approx(1e-3, rel=0.1)
+    assert comparison.used[300 * 3 + 80 : 300 * 3 + 240].all()
