@@ -38,6 +38,7 @@ from adxl_ros.report.quantities import listed
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.simulate.motion import ForcePath, Motion
 import numpy as np
+import scipy
 
 
 def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> list[str]:
@@ -122,7 +123,8 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     sensor = comparison.sensor
     is_stuck = stuck(comparison)
     readings_mps2 = to_nominal_mps2(comparison.volts, sensor)
-    disturbed = faults.repeated | faults.isolated | is_stuck.any(axis=1)
+    beside = scipy.ndimage.binary_dilation(faults.isolated)
+    disturbed = faults.repeated | beside | is_stuck.any(axis=1)
     comparison = replace(comparison, disturbed=disturbed)
     no_number = ~np.isfinite(comparison.volts).all(axis=1)
     comparison = leave_out(comparison, no_number, 'they are no numbers')
@@ -134,6 +136,9 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
         faults.isolated,
         'they stand alone, away from the samples around them',
         Detector.ISOLATED_SAMPLES,
+    )
+    comparison = leave_out(
+        comparison, beside, 'they are next to samples that stand alone, and may share a filter'
     )
     for d, axis in enumerate(sensor.axes):
         comparison = leave_out(
@@ -157,8 +162,7 @@ def _leave_out(
     comparison: BaselineComparison, rows: np.ndarray, reason: str, detector: Detector
 ) -> BaselineComparison:
     """Leave out samples that show the effect of a detector."""
-    effect = effect_of(detector)
-    return leave_out(comparison, rows, reason, effect)
+    return leave_out(comparison, rows, reason, effect_of(detector))
 
 
 def _notes_on_range(comparison: BaselineComparison) -> list[str]:

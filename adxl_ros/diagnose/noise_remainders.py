@@ -162,11 +162,11 @@ def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Se
     at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
     time_s = comparison.time_s
     volts = comparison.drawn_v(at_rate, seed)
-    # Spikes and repeated samples are left out, as those of the recording are.
+    # What is left out of the recording is left out, and spikes and repeated samples are, too.
     changing = repeated_samples(volts, time_s, np.ones(len(volts), bool), at_rate).regular
     residual_v = volts - comparison.simulated_v(at_rate)
     used = isolated_samples(volts, residual_v, time_s, changing, at_rate).regular
-    return _Series(volts, residual_v, bridged(residual_v, used))
+    return _Series(volts, residual_v, bridged(residual_v, used & comparison.used))
 
 
 class _Statistic(NamedTuple):

@@ -9,6 +9,7 @@ from adxl_ros.api.recordings import read_ideal
 from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.data_checks import check_gravity, compare_checked
 from adxl_ros.diagnose.data_faults import DataFault
+from adxl_ros.diagnose.noise_effects import residual_detections
 from adxl_ros.diagnose.sample_faults import sample_faults
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -382,3 +383,26 @@ def test_a_sensor_that_always_moves_has_no_rest():
     assert not at_rest(swinging).any()
     halted = np.where(time_s[:, None] < 20, swinging, swinging[5000])
     assert not at_rest(halted)[:4900].any() and at_rest(halted)[5200:].mean() > 0.9
+
+
+def test_samples_that_share_the_filter_of_a_spike_are_left_out_with_it(tmp_path):
+    carried = Carried()
+    places = np.arange(400, len(carried.time_s) - 400, 200)
+
+    def knocked(force):
+        force[places, 0] += 20.0
+        force[places + 1, 0] += 5.0
+        return force
+
+    comparison = carried.beside(tmp_path, carried.recorded(knocked))
+    assert not comparison.used[np.concatenate([places, places + 1])].any()
+
+
+def test_excess_noise_has_its_size_although_samples_are_left_out(tmp_path):
+    carried = Carried()
+    comparison = carried.beside(tmp_path, carried.recorded())
+    is_kept = np.arange(len(comparison)) % 400 > 150
+    comparison = replace(comparison, used=comparison.used & is_kept)
+    residual_v = 3 * comparison.simulated_noise_v(comparison.sensor, 5)
+    (found,) = residual_detections(comparison, residual_v, comparison.sensor)
+    assert found.values['ratio'] == pytest.approx(2.0, rel=0.1)
