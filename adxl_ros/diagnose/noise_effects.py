@@ -51,9 +51,10 @@ def residual_detections(
     line = _line(white, residual_v, comparison.time_s, sensor)
     # In motion, effects that are not modelled would look like noise, so that rests are preferred.
     resting = at_rest.sum() > _RESTING_FEWEST
+    # Bridges have no noise, so that both have the same.
     excess = _excess(
         residual_v,
-        comparison.simulated_noise_v(sensor, 0),
+        bridged(comparison.simulated_noise_v(sensor, 0), comparison.used),
         sensor,
         at_rest if resting else comparison.used,
         resting,
@@ -77,7 +78,10 @@ def _excess(
 ) -> Detection | None:
     """Find noise above the level of drawn noise in samples, (n,) bool, that may rest."""
     recorded = white_noise_v(residual_v, sensor, rows)
-    drawn = white_noise_v(simulated_v, sensor, rows)
+    # Rounding that stays in one pose is noise in another.
+    drawn = np.hypot(
+        white_noise_v(simulated_v, sensor, rows), np.sqrt(noise.held_rounding_v2(sensor))
+    )
     # The level of noise far below a step of the ADC does not show.
     shows = (noise.held_rounding(sensor) <= 0.5) & (drawn > 0)
     ratio = recorded / np.where(shows, drawn, np.inf)

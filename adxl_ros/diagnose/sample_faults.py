@@ -185,12 +185,11 @@ def isolated_samples(
     spikes &= 2 * _deviation_v(volts) > _deviation_v(residual_v)
     if not spikes.any():
         return SampleSearch(used)
-    rate_hz = spikes.sum() / len(sensor.axes) / float(np.mean(used) * np.ptp(time_s))
     found = detection_of(
         Detector.ISOLATED_SAMPLES,
         spikes.mean(axis=0) * size_v**2,
         sensor,
-        rate_hz=rate_hz,
+        rate_hz=spikes.mean(axis=1).sum() / float(np.mean(used) * np.ptp(time_s)),
         amplitude_v=size_v,
     )
     return SampleSearch(used & ~spikes.any(axis=1), [found])
@@ -345,35 +344,36 @@ def _clipping(comparison: BaselineComparison, low: np.ndarray, high: np.ndarray)
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
-    """Find an ADC whose codes are coarser than stated, on all axes or on some."""
-    if not sensor.lsb_v:
-        return None
-    bits = np.array([_lost_bits(v, sensor) for v in volts.T])
+    """
+    Find codes that are coarser than those of the stated ADC, on all axes or on some.
+
+    Where none is stated, its rounding is a part of the stated noise.
+    """
+    stated_v = np.where(sensor.lsb_v, sensor.lsb_v, np.sqrt(12) * noise.analog_std_v(sensor))
+    bits = np.array([_lost_bits(*of_axis) for of_axis in zip(volts.T, stated_v)])
     threshold = np.log2(COARSE_STEPS)
     if not (bits >= threshold).any():
         return None
+    steps_v = np.where(bits >= threshold, stated_v * 2**bits, sensor.lsb_v)
     fewest = float(np.nanmin(bits))
     common = fewest if fewest >= threshold else 0.0
-    return detection_of(
-        Detector.COARSE_CODES,
-        (sensor.lsb_v * 2 ** np.nan_to_num(bits)) ** 2 / 12,
-        sensor,
-        lost_bits=common,
-        axis_lost_bits=np.where(bits - common >= threshold, bits - common, 0.0),
-    )
+    further = np.where(bits - common >= threshold, bits - common, 0.0)
+    lost = {'lost_bits': common, 'axis_lost_bits': further}
+    values = lost if sensor.lsb_v else {'step_v': steps_v}
+    return detection_of(Detector.COARSE_CODES, steps_v**2 / 12, sensor, **values)
 
 
-def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:
+def _lost_bits(volts: np.ndarray, stated_v: float) -> float:
     """Return how many bits the codes of one axis, V, (n,), lack; NaN where too few differ."""
     distance_v = np.diff(np.unique(volts[np.isfinite(volts)]))
-    distance_v = distance_v[distance_v > sensor.lsb_v * _SMALLEST_CODE_STEPS]
-    if len(distance_v) < _CODES_FEWEST:
+    distance_v = distance_v[distance_v > stated_v * _SMALLEST_CODE_STEPS]
+    if len(distance_v) < _CODES_FEWEST or not stated_v:
         return float('nan')
     step_v = float(np.median(distance_v[distance_v < _NEAREST_CODES_RATIO * distance_v.min()]))
     # A slow motion through few samples leaves codes out; all multiples of a step are occupied.
     steps = distance_v / step_v
     between = np.mean(np.abs(steps - np.rint(steps)) > _BETWEEN_CODES_STEPS)
-    return 0.0 if between > _BETWEEN_CODES_SHARE else float(np.log2(step_v / sensor.lsb_v))
+    return 0.0 if between > _BETWEEN_CODES_SHARE else float(np.log2(step_v / stated_v))
 
 
 def code_step_v(volts: np.ndarray) -> np.ndarray:

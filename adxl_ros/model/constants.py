@@ -5,6 +5,7 @@
 G0_MPS2 = 9.80665
 """Standard gravity, m/s², exact (ISO 80000-3); the g of every coefficient in V/g or 1/g."""
 TINY = 2.2250738585072014e-308  # Smallest normal float64: a divisor that is never 0
+FINEST_V = 1e-12  # Step that stands for none, V. Chosen: below the rounding of volts
 AXES = 'xyz'  # Axis letters in the order of every array
 MEASURED_AXES = ('x', 'xy', 'xyz')  # The axes that a sensor may measure
 Z_90 = 1.6449

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from adxl_ros.model.constants import FINEST_V
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Environment, NOMINAL_ENVIRONMENT, Place, Value
 from adxl_ros.model.sensor import Sensor
@@ -72,10 +73,18 @@ def filtered_bandwidth_hz(rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
 
 
 def analog_std_v(sensor: Sensor) -> np.ndarray:
-    """Return the standard deviation of the noise behind the filter by axis, V, (m,)."""
+    """
+    Return the standard deviation of the noise behind the filter by axis, V, (m,).
+
+    Where the parameter file states no filter, the density is that of the samples, up to half of
+    their rate: a filter that an effect adds lets no more of it through.
+    """
     circuit = electronics(sensor)
+    bandwidth_hz = filtered_bandwidth_hz(circuit.rc_s, sensor.rate_hz)
+    if not sensor.rc_s:
+        bandwidth_hz = np.minimum(bandwidth_hz, sensor.rate_hz / 2)
     density = circuit.noise_ratio * sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
-    return density * np.sqrt(filtered_bandwidth_hz(circuit.rc_s, sensor.rate_hz))
+    return density * np.sqrt(bandwidth_hz)
 
 
 def sample_std_v(sensor: Sensor) -> np.ndarray:
@@ -92,10 +101,8 @@ def held_rounding(sensor: Sensor) -> np.ndarray:
     LSB²/(2π²k²)·exp(−(2πkσ/LSB)²) (Widrow and Kollár 2008, section 4.4). Above half a step of
     noise nothing of it is left.
     """
-    if not sensor.lsb_v:
-        return np.zeros(len(sensor.axes))
     harmonics = np.arange(1, _HARMONICS + 1)[:, None]
-    sigma_steps = analog_std_v(sensor) / electronics(sensor).lsb_v
+    sigma_steps = analog_std_v(sensor) / np.maximum(electronics(sensor).lsb_v, FINEST_V)
     return np.sum(
         6 / (np.pi * harmonics) ** 2 * np.exp(-((2 * np.pi * harmonics * sigma_steps) ** 2)),
         axis=0,

@@ -16,7 +16,7 @@ import itertools
 from typing import Any
 import zlib
 
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import AXES, FINEST_V, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     ARRAYS,
@@ -480,10 +480,13 @@ def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: np.ndarray) -> np.ndarray
     """Round volts, (..., m), to steps by axis, V, (m,), within the rails; 0 does not quantise."""
     if not np.any(lsb_v):
         return volts
-    highest = sensor.adc_vref_v - sensor.lsb_v
+    lsb_v = np.maximum(lsb_v, FINEST_V)
     coded = volts / lsb_v
     np.rint(coded, out=coded)
     coded *= lsb_v
+    if not sensor.adc_bits:
+        return coded
+    highest = sensor.adc_vref_v - sensor.lsb_v
     return np.clip(coded, 0.0, np.floor(highest / lsb_v) * lsb_v, out=coded)
 
 

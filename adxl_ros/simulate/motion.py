@@ -127,11 +127,12 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
     """Refuse an effect that has nothing to act on."""
     has_stage = motion.force is None
     is_robot = getattr(motion.force, 'is_robot', False)
+    has_steps = any(np.any(values.get('step_v')) for values in sensor.values.values())
     missing = {
         Need.STAGE: (has_stage, 'this manoeuvre has none, only specific force'),
         Need.ROTATION: (has_stage or is_robot, 'it is not known beside a specific force'),
         Need.ROBOT: (is_robot, f'the motion is not that of a robot; give {option("urdf")}'),
-        Need.ADC: (sensor.adc_bits > 0, 'the sensor has none: sensor.adc_bits is 0'),
+        Need.ADC: (sensor.adc_bits or has_steps, 'the sensor has none: sensor.adc_bits is 0'),
         Need.NOISE: (
             np.any(sensor.noise_density_g_per_rthz),
             'the sensor has none: sensor.noise_density_g_per_rthz is 0',

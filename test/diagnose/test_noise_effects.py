@@ -7,6 +7,8 @@ from dataclasses import replace
 from adxl_ros.diagnose import noise_effects, noise_remainders, sample_faults
 from adxl_ros.diagnose.noise_remainders import NoiseRemainder
 from adxl_ros.model import noise
+from adxl_ros.model.sensor import with_neutral, with_values
+from adxl_ros.model.signal_chain import quantise
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -162,6 +164,28 @@ def test_bits_that_one_axis_has_lost_are_its_own():
     assert found.values['axis_lost_bits'] == pytest.approx([0.0, 2.0])
     assert noise.electronics(found.added_to(made)).lsb_v == pytest.approx(steps_v)
     assert sample_faults.coarse_codes(np.rint(volts / made.lsb_v) * made.lsb_v, made) is None
+
+
+def test_coarse_codes_show_although_no_adc_is_stated():
+    """Rounding that the stated noise can hold is a part of it."""
+    made = sensor(adc_bits=0)
+    steps_v = noise.analog_std_v(made) * [20.0, 3.0]
+    volts = -np.rint(white_v(200 * steps_v[0]) / steps_v) * steps_v
+    found = sample_faults.coarse_codes(volts, made)
+    assert found.values['step_v'] == pytest.approx([steps_v[0], 0.0])
+    coarse = found.added_to(made)
+    lsb_v = noise.electronics(coarse).lsb_v
+    assert lsb_v == pytest.approx([steps_v[0], 0.0])
+    assert quantise(volts - 0.1 * steps_v, coarse, lsb_v) == pytest.approx(
+        volts - [0.0, 0.1 * steps_v[1]]
+    )
+
+
+def test_a_filter_adds_no_noise_where_none_is_stated():
+    made = with_neutral(sensor(rc_capacitance_f=0.0), ['bandwidth'])
+    for ratio in (1e-6, 1.0, 100.0):
+        filtered = with_values(made, 'bandwidth', {'resistance_ratio': np.full(2, ratio)})
+        assert np.all(noise.analog_std_v(filtered) <= noise.analog_std_v(made))
 
 
 def test_the_floor_is_without_lines_and_excess_noise():

@@ -173,6 +173,15 @@ def adc_inl(signals: Signals, p: Parameters) -> None:
         source='physics: a converter for each axis',
         doc='number of further bits that the axis loses',
     ),
+    OptionalSize(
+        'step_v',
+        unit='V',
+        lower=0.0,
+        upper=10.0,
+        scale=0.01,
+        source='physics: an output that is rounded',
+        doc='smallest step of the axis, also where the parameter file states no ADC',
+    ),
     smooth=False,
     acts_on=ActsOn.NOISE,
     needs=(Need.ADC,),
@@ -181,9 +190,10 @@ def adc_inl(signals: Signals, p: Parameters) -> None:
 )
 def quantisation(signals: Signals, p: Parameters) -> None:
     """Quantisation that is coarser than the resolution of the ADC."""
-    signals.lsb_v = signals.lsb_v * 2.0 ** p['lost_bits']
-    for d, lost in enumerate(p['axis_lost_bits']):
-        signals.lsb_ratio[d] = signals.lsb_ratio[d] * 2.0**lost
+    for d, (lost, step_v) in enumerate(zip(p['axis_lost_bits'], p['step_v'])):
+        ratio = signals.lsb_ratio[d] * 2.0 ** (p['lost_bits'] + lost)
+        signals.lsb_ratio[d] = max(signals.lsb_v * ratio, step_v)
+    signals.lsb_v = 1.0
 
 
 @effect(
