@@ -128,14 +128,17 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     comparison = replace(comparison, disturbed=disturbed)
     no_number = ~np.isfinite(comparison.volts).all(axis=1)
     comparison = leave_out(comparison, no_number, 'they are no numbers')
-    comparison = _leave_out(
-        comparison, faults.repeated, 'they repeat the one before', Detector.REPEATED_SAMPLES
+    comparison = leave_out(
+        comparison,
+        faults.repeated,
+        'they repeat the one before',
+        effect_of(Detector.REPEATED_SAMPLES),
     )
-    comparison = _leave_out(
+    comparison = leave_out(
         comparison,
         faults.isolated,
         'they stand alone, away from the samples around them',
-        Detector.ISOLATED_SAMPLES,
+        effect_of(Detector.ISOLATED_SAMPLES),
     )
     comparison = leave_out(
         comparison, beside, 'they are next to samples that stand alone, and may share a filter'
@@ -149,20 +152,13 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
         )
         held = faults.held[:, d]
         ends = [f'{end:.4g}' for end in np.unique(readings_mps2[held, d])]
-        comparison = _leave_out(
+        comparison = leave_out(
             comparison,
             held,
             f'{axis} is held at {listed(ends, "and")} m/s², the end of its range',
-            Detector.HELD_AT_END,
+            effect_of(Detector.HELD_AT_END),
         )
     return replace(comparison, notes=(*comparison.notes, *_notes_on_range(comparison)))
-
-
-def _leave_out(
-    comparison: BaselineComparison, rows: np.ndarray, reason: str, detector: Detector
-) -> BaselineComparison:
-    """Leave out samples that show the effect of a detector."""
-    return leave_out(comparison, rows, reason, effect_of(detector))
 
 
 def _notes_on_range(comparison: BaselineComparison) -> list[str]:

@@ -51,10 +51,11 @@ def residual_detections(
     line = _line(white, residual_v, comparison.time_s, sensor)
     # In motion, effects that are not modelled would look like noise, so that rests are preferred.
     resting = at_rest.sum() > _RESTING_FEWEST
-    # Bridges have no noise, so that both have the same.
+    # Bridges have no noise, and spread a line: both series have the same bridges, and the line.
+    drawn_v = comparison.simulated_noise_v(line.added_to(sensor) if line else sensor, 0)
     excess = _excess(
         residual_v,
-        bridged(comparison.simulated_noise_v(sensor, 0), comparison.used),
+        bridged(drawn_v, comparison.used),
         sensor,
         at_rest if resting else comparison.used,
         resting,

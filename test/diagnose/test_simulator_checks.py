@@ -398,11 +398,22 @@ def test_samples_that_share_the_filter_of_a_spike_are_left_out_with_it(tmp_path)
     assert not comparison.used[np.concatenate([places, places + 1])].any()
 
 
-def test_excess_noise_has_its_size_although_samples_are_left_out(tmp_path):
+@pytest.fixture
+def with_gaps(tmp_path):
     carried = Carried()
     comparison = carried.beside(tmp_path, carried.recorded())
     is_kept = np.arange(len(comparison)) % 400 > 150
-    comparison = replace(comparison, used=comparison.used & is_kept)
-    residual_v = 3 * comparison.simulated_noise_v(comparison.sensor, 5)
-    (found,) = residual_detections(comparison, residual_v, comparison.sensor)
+    return replace(comparison, used=comparison.used & is_kept)
+
+
+def test_excess_noise_has_its_size_although_samples_are_left_out(with_gaps):
+    residual_v = 3 * with_gaps.simulated_noise_v(with_gaps.sensor, 5)
+    (found,) = residual_detections(with_gaps, residual_v, with_gaps.sensor)
     assert found.values['ratio'] == pytest.approx(2.0, rel=0.1)
+
+
+def test_a_line_that_gaps_spread_is_no_excess_noise(with_gaps):
+    line_v = 0.2 * np.sin(2 * np.pi * 49.98 * with_gaps.time_s)[:, None]
+    residual_v = with_gaps.simulated_noise_v(with_gaps.sensor, 5) + line_v
+    (found,) = residual_detections(with_gaps, residual_v, with_gaps.sensor)
+    assert found.effect == 'mains_hum'
