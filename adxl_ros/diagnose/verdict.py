@@ -112,7 +112,8 @@ class Verdict:
     @property
     def remaining(self) -> float:
         """Power beside the best set: what repeats, or all above the noise where that is more."""
-        return max(self.remainder.value, self.left.value, 0.0)
+        is_above = self.left.low > 0
+        return max(self.remainder.value, self.left.value if is_above else 0.0, 0.0)
 
     @property
     def explained_share(self) -> float:
@@ -149,15 +150,15 @@ class _Powers(NamedTuple):
     """What the best set explains and leaves, (m/s²)²."""
 
     explained: float  # Explained power
-    above: float  # What is left above the noise floor, repeating or not
+    above: float  # What is left above the noise floor, repeating or not; 0 if that is not material
     repeats: float  # What repeats beside the set and the drifts; 0 where it is not material
     drift: float  # Power of the first drift
     drifts: Sequence[str]  # The drifts of the noise, the best first
 
-    def remaining(self, material: float) -> float:
-        """Return what is left beside effects: what repeats, or all that no drift explains."""
-        is_more = self.above > material and not self.drifts
-        return max(self.repeats, self.above) if is_more else self.repeats
+    @property
+    def remaining(self) -> float:
+        """What is left beside effects: what repeats, or all that no drift explains."""
+        return self.repeats if self.drifts else max(self.repeats, self.above)
 
 
 def _powers(
@@ -170,7 +171,7 @@ def _powers(
     """Weigh what the best set and the noise leave, and drop the drifts where it is none."""
     explained = max(evidence.explained(best), 0.0)
     left = value_of(evidence.left(best))
-    above = left - of_noise
+    above = left - of_noise if evidence.is_above_floor(best, of_noise) else 0.0
     repeats = evidence.figure(evidence.mean(found.remainder.squares))
     material = repeats.value if found.repeats and repeats.low > remainder_material else 0.0
     if not found.drifts:
@@ -224,20 +225,19 @@ def _answer(
 ) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
     best, *others = minimal_sets(evidence)
-    material = evidence.material_power(1.0)
     detected = frozenset(cause.effect for cause in in_noise)
     # Only samples that are compared say what is left.
     of_noise = sum(cause.power_mps2 for cause in in_noise if not cause.is_left_out)
     powers = _powers(evidence, best, found, remainder_material, of_noise)
     # A reference that lacks motion leaves more than a floor at rest.
     only_repeats = evidence.fades or not best
-    unexplained = powers.repeats if only_repeats else powers.remaining(material)
+    unexplained = powers.repeats if only_repeats else powers.remaining
     if unexplained > powers.explained + powers.drift + of_noise:
         return _Answer('unknown')
     named = frozenset(() if evidence.wanders else powers.drifts)
     if not best | detected | named:
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
-        is_much = powers.above > max(evidence.floor_mps2**2, material)
+        is_much = powers.above > value_of(evidence.floor)
         return _Answer('unknown' if is_much else 'no_gap')
     groups = _groups(best, _rivals(evidence, best, others, powers))
     certain = best.difference(*groups) | detected
@@ -246,7 +246,7 @@ def _answer(
         certain -= named
     else:
         certain |= named
-    remaining = powers.remaining(material) if best else powers.repeats
+    remaining = powers.remaining if best else powers.repeats
     is_partly = remaining > SHARE_OF_FORM * (powers.explained + remaining)
     if groups and is_partly and not certain:
         # Nothing is named for certain, and none of the rivals explains what repeats.
@@ -356,7 +356,7 @@ def decide(
         left=evidence.interval(evidence.left(best)),
         upper_limit_mps2=(unseen + tolerated) ** 0.5,
         tolerated_mps2=tolerated**0.5,
-        lost_without={e: evidence.interval(evidence.lost_without(best, e)) for e in sorted(best)},
+        lost_without={e: evidence.interval(evidence.lost(best, best - {e})) for e in sorted(best)},
         remainder_follows=tuple(
             d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2
         ),

@@ -95,7 +95,8 @@ class Evidence:
     errs_in_motion: bool  # Whether it errs in motion, too, as a robot does
     fades: bool  # Whether the reference lacks motion
     wanders: bool  # Whether the reference may drift slowly, so that no drift is of the sensor
-    floor_mps2: float  # Noise floor, m/s²; infinite where it is assumed
+    # Noise floor by draw of its own pieces, (m/s²)²; infinite where nobody knows how sure it is
+    floor: ByDraw
     # Effects of each set none of whose sizes differs from 0
     sizeless: Mapping[frozenset[str], frozenset[str]] = field(default_factory=dict)
     # The sets that could be the answer, simulated again, not linearised
@@ -114,7 +115,13 @@ class Evidence:
 
     def left(self, effects: frozenset[str]) -> ByDraw:
         """Return the power above the noise floor that a set leaves."""
-        return self.mean(self.candidates[effects][HEALTHY].figures.squares) - self.floor_mps2**2
+        return self.squares(effects) - self.floor[: len(self.weights)]
+
+    def is_above_floor(self, effects: frozenset[str], of_noise: float) -> bool:
+        """Determine whether a set leaves materially more than the noise floor can be."""
+        highest = float(np.quantile(self.floor, _HIGHEST, method='nearest'))
+        left = self.figure(self.squares(effects)).low - highest
+        return left - of_noise > self.material_power(1.0)
 
     def material_power(self, pose_share: float) -> float:
         """Return the power that a user would act on and that is not of the reference, (m/s²)²."""
@@ -161,6 +168,10 @@ class Evidence:
         smallest = _NATS + np.log(max(len(tried), 1))
         return any(figure.value > smallest and figure.low > 0 for figure in figures)
 
+    def squares(self, effects: frozenset[str]) -> ByDraw:
+        """Return the power that a set leaves, in healthy noise."""
+        return self.mean(self.candidates[effects][HEALTHY].figures.squares)
+
     def gain(self, more: frozenset[str], less: frozenset[str]) -> ByDraw:
         """Return by how much one set explains more power than another."""
         return self.mean(self._figures(less).squares - self._figures(more).squares)
@@ -169,16 +180,15 @@ class Evidence:
         """Return the power that a set explains."""
         return value_of(self.gain(effects, NOTHING))
 
-    def lost_without(self, effects: frozenset[str], effect: str) -> ByDraw:
+    def lost(self, effects: frozenset[str], part: frozenset[str]) -> ByDraw:
         """
-        Return what a set explains less without an effect.
+        Return what a part of a set explains less.
 
-        Beside a drift the squares scatter as it does: what the effect changes is the figure.
+        Beside a drift the squares scatter as it does: by how much predictions differ is the figure.
         """
-        drifting = self.candidates[effects].get(self.noise)
-        if self.noise == HEALTHY or drifting is None:
-            return self.gain(effects, effects - {effect})
-        return self.mean(drifting.changes[effect])
+        if self.noise == HEALTHY:
+            return self.gain(effects, part)
+        return self.mean(self._fits(effects).squares_between(self._fits(part)))
 
     def nats(self, more: frozenset[str], less: frozenset[str]) -> ByDraw:
         """Return by how much a set makes held-out samples more probable."""
@@ -194,9 +204,7 @@ class Evidence:
     def is_beyond_form(self, effects: frozenset[str], others: frozenset[str]) -> bool:
         """Determine whether a set explains materially more than others with errors of form."""
         # No error of form holds a tenth of the power, and most effects of a set hold more.
-        (effect,) = effects - others
-        lost = value_of(self.lost_without(effects, effect))
-        if lost > SHARE_OF_FORM * self.explained(effects):
+        if value_of(self.lost(effects, others)) > SHARE_OF_FORM * self.explained(effects):
             return True
         # A weak effect that all blocks do not show is not looked for in draws of them.
         if self.is_draw and others not in self._fits(effects).beside_errors:
@@ -222,23 +230,35 @@ class Evidence:
         return Interval(value, min(float(low), value), max(float(high), value))
 
 
-def _is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
-    """Determine whether a set loses a material part of what it explains without an effect."""
-    others = effects - {effect}
-    if effect in evidence.sizeless.get(effects, ()) or others not in evidence.candidates:
-        return False
-    lost = evidence.figure(evidence.lost_without(effects, effect))
-    nats = evidence.figure(evidence.nats(effects, others))
+def _is_shown_by_pose(effect: str) -> bool:
+    """Return whether an effect only changes with the pose."""
     proof = {*effect_named(effect).diagnosis.proof}
-    by_pose = bool(proof) and proof <= _SHOWN_BY_POSE
-    is_certain = nats.value > _NATS and max(nats.low, lost.low) > 0
-    return is_certain and lost.value > evidence.material_power(float(by_pose))
+    return bool(proof) and proof <= _SHOWN_BY_POSE
+
+
+def _loses(evidence: Evidence, effects: frozenset[str], part: frozenset[str]) -> bool:
+    """Determine whether a part of a set explains materially less."""
+    lost = evidence.figure(evidence.lost(effects, part))
+    nats = evidence.figure(evidence.nats(effects, part))
+    by_pose = all(map(_is_shown_by_pose, effects - part))
+    # Beside a drift, what is lost is a square, which is never below 0.
+    is_certain = nats.low > 0 or (evidence.noise == HEALTHY and lost.low > 0)
+    is_material = lost.value > evidence.material_power(float(by_pose))
+    return nats.value > _NATS and is_certain and is_material
 
 
 def _is_minimal(evidence: Evidence, effects: frozenset[str]) -> bool:
-    """Determine whether all effects of a set are needed, beyond errors of form of the others."""
-    return all(_is_needed(evidence, effects, e) for e in effects) and all(
-        evidence.is_beyond_form(effects, effects - {e}) for e in effects
+    """
+    Determine whether all effects of a set are needed, beyond errors of form of the others.
+
+    No smaller part of a set may be better than a larger one: it would be the one to beat.
+    """
+    without_one = [effects - {e} for e in effects]
+    if evidence.sizeless.get(effects) or not {*without_one} <= {*evidence.candidates}:
+        return False
+    parts = [part for part in evidence.candidates if part < effects]
+    return all(_loses(evidence, effects, part) for part in parts) and all(
+        evidence.is_beyond_form(effects, part) for part in without_one
     )
 
 
