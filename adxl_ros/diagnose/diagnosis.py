@@ -45,7 +45,7 @@ from adxl_ros.diagnose.sample_faults import residual_shows_spikes
 from adxl_ros.diagnose.search import Hypothesis, Search
 from adxl_ros.diagnose.verdict import MATERIAL_MG, Verdict
 from adxl_ros.diagnose.verdict_sensor import as_printed, named_sensor, with_likely_drift
-from adxl_ros.diagnose.weighing import Evidence, HEALTHY, SimulatedAgain
+from adxl_ros.diagnose.weighing import ByDraw, Evidence, HEALTHY, SimulatedAgain
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model.constants import G0_MPS2
@@ -226,7 +226,7 @@ def _evidence(search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int
         errs_in_motion=robot_mps2 > 0,
         fades=any(c.fading_hz is not None for c in comparisons),
         wanders=any(getattr(c.motion.force, 'wanders', False) for c in comparisons),
-        floor=floor.power(seed, len(weights) - 1),
+        floor=ByDraw(floor.power(seed, len(weights) - 1)),
         sizeless={effects: h.sizeless for effects, h in search.found.items()},
     )
 

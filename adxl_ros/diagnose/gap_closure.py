@@ -45,13 +45,13 @@ def gap_closure(
     def left(effects: frozenset[str]) -> np.ndarray:
         """Return the power that a set leaves, (m/s²)², by draw."""
         # A difference of squares may fall below 0 by rounding.
-        return np.maximum(evidence.squares(effects), 0.0) + removed_power
+        return np.maximum(evidence.squares(effects).values, 0.0) + removed_power
 
     before = left(frozenset())
     after = left(best)
     stated_mps2 = rms(noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2))
-    is_sure = np.isfinite(evidence.floor)
-    floors_mps2 = np.sqrt(np.where(is_sure, evidence.floor, floor.rms_mps2**2))
+    is_sure = np.isfinite(evidence.floor.values)
+    floors_mps2 = np.sqrt(np.where(is_sure, evidence.floor.values, floor.rms_mps2**2))
     # No set leaves less than the noise.
     floors_mps2 = np.minimum(floors_mps2, np.sqrt(after))
     lowest_mps2 = np.array([floor_without(f, remainders, stated_mps2) for f in floors_mps2])

@@ -60,8 +60,8 @@ class NoiseFloor:
         """
         Return its mean square, and that of pieces drawn with replacement, (m/s²)², (1 + draws,).
 
-        It is infinite where it is assumed, or of too few pieces to say how sure it is: then nothing
-        is above it.
+        It is infinite where it is assumed, or of too few pieces to say how sure it is, so that
+        nothing is above it.
         """
         count = len(self.squares)
         if count < _FEWEST_PIECES:
@@ -70,9 +70,7 @@ class NoiseFloor:
         squares = np.add.reduceat(self.squares, edges)
         samples = np.add.reduceat(self.samples, edges)
         drawn = np.random.default_rng(seed).integers(0, len(edges), (draws, len(edges)))
-        return np.append(
-            self.rms_mps2**2, squares[drawn].sum(axis=1) / samples[drawn].sum(axis=1)
-        )
+        return np.append(self.rms_mps2**2, squares[drawn].sum(axis=1) / samples[drawn].sum(axis=1))
 
 
 class PartSquares(NamedTuple):
