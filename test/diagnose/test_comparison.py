@@ -49,7 +49,7 @@ def test_the_residual_is_recording_minus_simulation(compared):
 
 
 def test_the_search_has_the_filter_of_the_recording():
-    """A digital filter follows the rate of the sensor, not that of the samples that are searched."""
+    """A digital filter follows the rate of the sensor, not that of the searched samples."""
     sensor = replace(unit(), rate_hz=500.0, filter_rate_hz=125.0)
     comparison = beside.compare(simulated(sensor, motion=turning()), sensor)
     searched = beside.at_search_rate(comparison)
