@@ -80,8 +80,8 @@ def whiten_channel(
         grams.append(block_grams(white) if by_block else np.zeros((0, 0, 0)))
         total_grams.append(grams[-1].sum(axis=0) if by_block else white @ white.T)
         # The log determinant of the filter for errors, sample by sample.
-        scale = np.ones(len(used)) if whitener.errors is None else whitener.errors.scale
-        log_scales.append(sum_by_block(np.where(used, np.log(scale), 0.0)))
+        log_scale = np.log(whitener.errors.scale) if whitener.errors else 0.0
+        log_scales.append(sum_by_block(used * log_scale))
     return WhitenedChannel(
         column_ids=column_ids,
         block_grams=np.array(grams),

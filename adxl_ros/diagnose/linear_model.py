@@ -414,7 +414,7 @@ class LinearModel:
 
     @cached_property
     def tolerances(self) -> dict[Coefficient, float]:
-        """Standard deviations of the nuisance parameters in a healthy unit."""
+        """Return the standard deviations of the nuisance parameters in a healthy unit."""
         return {name: self._tolerance(name) for name in self.nuisances}
 
     def _tolerance(self, name: Coefficient) -> float:

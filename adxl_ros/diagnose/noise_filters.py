@@ -72,7 +72,7 @@ def in_pairs(series: np.ndarray) -> Iterator[np.ndarray]:
     A recursion waits for its last output, so that a complex one takes no longer than a real one.
     """
     for real, imaginary in zip_longest(series[::2], series[1::2], fillvalue=0.0):
-        yield real + 1j * imaginary
+        yield np.add(real, 1j * imaginary)
 
 
 @dataclass(frozen=True)
