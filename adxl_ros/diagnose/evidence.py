@@ -239,7 +239,7 @@ class _SelectedChannel:
         if blocks is not None:
             chosen = blocks
             grams = channel.block_grams[:, blocks].sum(axis=1)
-        allowed = np.isin(channel.drift_effects, ('', *drifts))
+        allowed = np.array([e in ('', *drifts) for e in channel.drift_effects], bool)
         return cls(
             places=np.searchsorted(ids, channel.column_ids[columns]),
             grams=grams[:, rows[:, None], rows],
