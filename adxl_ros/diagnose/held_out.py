@@ -138,7 +138,7 @@ class HeldOutFits:
     def _plain(self) -> list[np.ndarray]:
         """Products of the columns of each channel, mean over axes, by block, (m/s²)²."""
         return [
-            linear.plain_grams(columns.values, place.comparison.used) / place.v_per_mean_mps2**2
+            linear.block_grams(columns.values.T * place.comparison.used) / place.v_per_mean_mps2**2
             for columns, place in zip(self.linearised.columns, self.model.places)
         ]
 

@@ -174,7 +174,7 @@ def linearise(
     # calibration can take up of the effects.
     parts = linear_model.taken_up(changes, 1)
     taken_up = np.array([float(parts[n][0]) if n in parts else 0.0 for n in nuisances])
-    tolerance = np.array([linear_model.tolerance(name) for name in nuisances])
+    tolerance = np.array([linear_model.tolerances[name] for name in nuisances])
     linearised = LinearisedHypothesis(
         effects=tuple(effects),
         sensor=point.sensor,
