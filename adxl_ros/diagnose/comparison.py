@@ -183,7 +183,13 @@ class BaselineComparison:
 
     def simulated_v(self, sensor: Sensor) -> np.ndarray:
         """Return the mean output of a sensor in this recording, V, (n, m)."""
-        return whole_response(noiseless(sensor), self.motion, 0, self.time_s, self.memo)
+        at_rate = noiseless(self.at_rate(sensor))
+        return whole_response(at_rate, self.motion, 0, self.time_s, self.memo)
+
+    def at_rate(self, sensor: Sensor) -> Sensor:
+        """Return a sensor at the rate of these samples, which passed the recording's filter."""
+        own = self.sensor
+        return replace(sensor, rate_hz=own.rate_hz, filter_rate_hz=own.filter_rate_hz)
 
     def residual_v(self, sensor: Sensor) -> np.ndarray:
         """
@@ -191,17 +197,16 @@ class BaselineComparison:
 
         Without a reference the pose is unknown, and the mean of the residual is subtracted.
         """
-        residual_v = self.volts - self.simulated_v(replace(sensor, rate_hz=self.sensor.rate_hz))
+        residual_v = self.volts - self.simulated_v(sensor)
         return residual_v if self.pose_known else residual_v - np.nanmean(residual_v, axis=0)
 
     def simulated_noise_v(self, sensor: Sensor, seed: int) -> np.ndarray:
         """Draw a sensor's output about its own mean, V, (n, m)."""
-        at_rate = replace(sensor, rate_hz=self.sensor.rate_hz)
-        return self.drawn_v(at_rate, seed) - self.simulated_v(at_rate)
+        return self.drawn_v(sensor, seed) - self.simulated_v(sensor)
 
     def drawn_v(self, sensor: Sensor, seed: int) -> np.ndarray:
-        """Draw the output of a sensor at this sample rate, V, (n, m)."""
-        return whole_response(sensor, self.motion, seed, self.time_s, self.memo)
+        """Draw the output of a sensor, V, (n, m)."""
+        return whole_response(self.at_rate(sensor), self.motion, seed, self.time_s, self.memo)
 
     @cached_property
     def robot_error_mps2(self) -> float:
@@ -269,7 +274,7 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
         comparison,
         motion=motion,
         memo=ChainMemo(),
-        sensor=replace(comparison.sensor, rate_hz=rate_hz / every),
+        sensor=comparison.sensor.computed_at(rate_hz / every),
         **{
             name: getattr(comparison, name)[::every]
             for name in ('time_s', 'volts', 'at_rest', 'used', 'disturbed')

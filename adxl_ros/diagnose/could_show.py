@@ -108,7 +108,7 @@ def _mean_could_show(model: LinearModel, material_mps2: float) -> list[CouldShow
                 certain = _SHOWN_STDS * information**-0.5
                 size = max(certain, material_mps2 * power_mps2**-0.5)
             if hints.nuisance:
-                size = np.hypot(size, 3 * model.tolerance(model.names[k]))
+                size = np.hypot(size, 3 * model.tolerances[model.names[k]])
             rows.append(CouldShow(model.names[k], float(size), share))
     return rows
 

@@ -45,7 +45,7 @@ from adxl_ros.diagnose.sample_faults import residual_shows_spikes
 from adxl_ros.diagnose.search import Hypothesis, Search
 from adxl_ros.diagnose.verdict import MATERIAL_MG, Verdict
 from adxl_ros.diagnose.verdict_sensor import as_printed, named_sensor, with_likely_drift
-from adxl_ros.diagnose.weighing import Evidence, HEALTHY, SimulatedAgain
+from adxl_ros.diagnose.weighing import ByDraw, Evidence, HEALTHY, SimulatedAgain
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model.constants import G0_MPS2
@@ -215,17 +215,18 @@ def _evidence(search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int
     model = search.model
     comparisons = model.comparisons
     counts = np.sum([sum_by_block(c.used) for c in comparisons], axis=0)
+    weights = rule.block_weights(seed)
     robot_mps2 = max(c.robot_error_mps2 for c in comparisons)
     return Evidence(
         candidates=_held_out(search),
         counts=counts,
-        weights=rule.block_weights(seed),
+        weights=weights,
         material_mps2=smallest_mps2,
         reference_mps2=float(max(model.smallest_angle_rad() * G0_MPS2, robot_mps2)),
         errs_in_motion=robot_mps2 > 0,
         fades=any(c.fading_hz is not None for c in comparisons),
         wanders=any(getattr(c.motion.force, 'wanders', False) for c in comparisons),
-        floor_mps2=np.inf if floor.source == 'assumed' else floor.rms_mps2,
+        floor=ByDraw(floor.power(seed, len(weights) - 1)),
         sizeless={effects: h.sizeless for effects, h in search.found.items()},
     )
 
@@ -379,7 +380,7 @@ def _report(
     removed_power = removed / sum(len(c) for c in comparisons)
     return Report(
         verdict=verdict,
-        closure=gap_closure(verdict, evidence, floor, remainders, baseline, removed_power, seed),
+        closure=gap_closure(verdict, evidence, floor, remainders, baseline, removed_power),
         noise_floor=floor,
         hypotheses=(best, *(h for h in ranked if h is not best)),
         detections=tuple(detections),

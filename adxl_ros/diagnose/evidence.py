@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise, repeat
 from typing import NamedTuple
 
-from adxl_ros.diagnose.noise_filters import drifts_among, Whitener, without_pole
+from adxl_ros.diagnose.noise_filters import drifts_among, in_pairs, Whitener, without_pole
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Role
 from adxl_ros.model.error_sizes import stds
@@ -79,8 +80,8 @@ def whiten_channel(
         grams.append(block_grams(white) if by_block else np.zeros((0, 0, 0)))
         total_grams.append(grams[-1].sum(axis=0) if by_block else white @ white.T)
         # The log determinant of the filter for errors, sample by sample.
-        scale = np.ones(len(used)) if whitener.errors is None else whitener.errors.scale
-        log_scales.append(sum_by_block(np.where(used, np.log(scale), 0.0)))
+        log_scale = np.log(whitener.errors.scale) if whitener.errors else 0.0
+        log_scales.append(sum_by_block(used * log_scale))
     return WhitenedChannel(
         column_ids=column_ids,
         block_grams=np.array(grams),
@@ -95,31 +96,29 @@ def whiten_channel(
 def white_rows(
     design: np.ndarray, used: np.ndarray, filters: Sequence[Whitener]
 ) -> Iterator[np.ndarray]:
-    """Yield k columns, (n, k), whitened by each filter, (k, n); 0 where they are not used."""
-    data = np.ascontiguousarray(bridged(design, used).T, float)
+    """
+    Yield k columns, (n, k), whitened by each filter, (k, n); 0 where they are not used.
+
+    Those of the next filter take the memory of the last one.
+    """
+    rows = bridged(design, used).T
     # Filters share that for errors of angles, which is applied once.
-    shared = {id(f.errors): f.errors for f in filters}
-    pole = filters[0].pole
-    before = {k: without_pole(data, pole) if e is None else e(data) for k, e in shared.items()}
+    shared = {id(f.errors): f.errors or partial(without_pole, pole=f.pole) for f in filters}
+    before = {number: [*map(run, in_pairs(rows))] for number, run in shared.items()}
     # The first sample is a step from zero.
-    counted = used.copy()
-    counted[0] = False
+    left_out = [0, *np.flatnonzero(~used)]
+    white = np.empty((len(rows) + 1, len(used)))
     for whitener in filters:
-        white = scipy.signal.sosfilt(whitener.sections, before[id(whitener.errors)])
-        white *= counted
-        yield white
+        for i, pair in enumerate(before[id(whitener.errors)]):
+            filtered = scipy.signal.sosfilt(whitener.sections, pair)
+            white[2 * i], white[2 * i + 1] = filtered.real, filtered.imag
+        white[:, left_out] = 0.0
+        yield white[: len(rows)]
 
 
 def sum_by_block(values: np.ndarray) -> np.ndarray:
     """Return the sums of values, (n,), or how many of them are True, by block, (blocks,)."""
     return np.add.reduceat(values, block_edges(len(values))[:-1]).astype(float)
-
-
-def plain_grams(columns: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the products of k columns, (n, k), over used samples, by block, (blocks, k, k)."""
-    edges = pairwise(block_edges(len(used)).tolist())
-    parts = (columns[a:b].T * used[a:b] for a, b in edges)
-    return np.array([part @ part.T for part in parts])
 
 
 def block_grams(rows: np.ndarray) -> np.ndarray:
@@ -240,7 +239,7 @@ class _SelectedChannel:
         if blocks is not None:
             chosen = blocks
             grams = channel.block_grams[:, blocks].sum(axis=1)
-        allowed = np.isin(channel.drift_effects, ('', *drifts))
+        allowed = np.array([e in ('', *drifts) for e in channel.drift_effects], bool)
         return cls(
             places=np.searchsorted(ids, channel.column_ids[columns]),
             grams=grams[:, rows[:, None], rows],

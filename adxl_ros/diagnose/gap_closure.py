@@ -9,7 +9,7 @@ from typing import NamedTuple
 from adxl_ros.diagnose.noise_floor import NoiseFloor
 from adxl_ros.diagnose.noise_remainders import floor_without, NoiseRemainder
 from adxl_ros.diagnose.verdict import Verdict
-from adxl_ros.diagnose.weighing import Evidence, HEALTHY
+from adxl_ros.diagnose.weighing import Evidence
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.error_sizes import rms
@@ -34,7 +34,6 @@ def gap_closure(
     remainders: Sequence[NoiseRemainder],
     sensor: Sensor,
     removed_power: float,
-    seed: int,
 ) -> GapClosure:
     """
     Return the gap before and after the best set, above the floor without noise-like effects.
@@ -45,25 +44,21 @@ def gap_closure(
 
     def left(effects: frozenset[str]) -> np.ndarray:
         """Return the power that a set leaves, (m/s²)², by draw."""
-        squares = evidence.candidates[effects][HEALTHY].figures.squares
         # A difference of squares may fall below 0 by rounding.
-        return np.maximum(evidence.mean(squares), 0.0) + removed_power
+        return np.maximum(evidence.squares(effects).values, 0.0) + removed_power
 
     before = left(frozenset())
     after = left(best)
     stated_mps2 = rms(noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2))
-    floors_mps2 = np.full(len(before), floor.rms_mps2)
-    drawn_mps2 = floor.draws_mps2(seed, len(before) - 1)
-    if drawn_mps2 is not None:
-        floors_mps2[1:] = drawn_mps2
+    is_sure = np.isfinite(evidence.floor.values)
+    floors_mps2 = np.sqrt(np.where(is_sure, evidence.floor.values, floor.rms_mps2**2))
     # No set leaves less than the noise.
     floors_mps2 = np.minimum(floors_mps2, np.sqrt(after))
     lowest_mps2 = np.array([floor_without(f, remainders, stated_mps2) for f in floors_mps2])
     above_floor = before - lowest_mps2**2
     with np.errstate(all='ignore'):
         closed = (before - after) / np.where(before > lowest_mps2**2, above_floor, np.nan)
-    if drawn_mps2 is None:
-        lowest_mps2[1:] = np.nan
+    lowest_mps2[1:][~is_sure[1:]] = np.nan
     return GapClosure(
         before=_interval(np.sqrt(before)),
         after=_interval(np.sqrt(after)),

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain, repeat
+from itertools import chain, pairwise, repeat
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence as linear
@@ -66,6 +66,8 @@ class HeldOutFits:
     drifts: tuple[str, ...] = ()
     # Figures beside errors of form, as far as they were asked for, by the effects that have them
     beside_errors: dict[frozenset[str], HeldOut] = field(default_factory=dict)
+    # Squares by which predictions differ from those of other sets, as far as they were asked for
+    _between: dict[tuple[str, ...], np.ndarray] = field(default_factory=dict)
 
     def beside_form_errors(self, effects: frozenset[str]) -> HeldOut:
         """Return the figures where some effects of the set have errors of form, too."""
@@ -136,24 +138,35 @@ class HeldOutFits:
     def _plain(self) -> list[np.ndarray]:
         """Products of the columns of each channel, mean over axes, by block, (m/s²)²."""
         return [
-            linear.plain_grams(columns.values, place.comparison.used) / place.v_per_mean_mps2**2
+            linear.block_grams(columns.values.T * place.comparison.used) / place.v_per_mean_mps2**2
             for columns, place in zip(self.linearised.columns, self.model.places)
         ]
 
     @cached_property
-    def changes(self) -> dict[str, np.ndarray]:
-        """Squares of what each effect changes of the held-out blocks, (m/s²)², (blocks,) each."""
-        every = {}
-        for effect in self.linearised.effects:
-            own = np.array([name.effect == effect for name in self.linearised.names])
-            squares = every[effect] = np.zeros(BLOCKS)
+    def _left_v(self) -> list[np.ndarray]:
+        """What is left of the held-out samples of each channel, V, (n,)."""
+        every = []
+        for columns in self.linearised.columns:
+            values = columns.values
+            left_v = np.zeros(len(values))
+            edges = list(pairwise(linear.block_edges(len(values))))
             for fold in self.folds:
-                departures = np.where(own, fold.departures, 0.0)
-                for columns, plain_mps2 in zip(self.linearised.columns, self._plain):
-                    v = departures[columns.places]
-                    parts = plain_mps2[fold.held_out, 1:, 1:] @ v
-                    squares[fold.held_out] += parts @ v
+                v = columns.combination(fold.departures)
+                for block in np.flatnonzero(fold.held_out):
+                    samples = slice(*edges[block])
+                    left_v[samples] = values[samples] @ v
+            every.append(left_v)
         return every
+
+    def squares_between(self, other: HeldOutFits) -> np.ndarray:
+        """Squares by which predictions differ, mean over axes, by block, (m/s²)², (blocks,)."""
+        if other.healthy.effects not in self._between:
+            squares = np.zeros(BLOCKS)
+            for place, own_v, other_v in zip(self.model.places, self._left_v, other._left_v):
+                between = (own_v - other_v) * place.comparison.used / place.v_per_mean_mps2
+                squares += linear.sum_by_block(between**2)
+            self._between[other.healthy.effects] = squares
+        return self._between[other.healthy.effects]
 
     @property
     def tolerated(self) -> np.ndarray:

@@ -68,7 +68,7 @@ def _products(model: LinearModel, hypothesis: Hypothesis) -> np.ndarray:
     file_values = with_neutral(model.baseline, effects).values
     products = np.zeros((len(effects) + len(model.names),) * 2)
     for number, (comparison, axis) in enumerate(model.places):
-        sensor = replace(hypothesis.sensor, rate_hz=comparison.sensor.rate_hz)
+        sensor = hypothesis.sensor
         rows = []
         for effect in effects:
             without = replace(sensor, values={**sensor.values, effect: file_values[effect]})

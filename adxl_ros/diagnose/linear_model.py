@@ -409,10 +409,15 @@ class LinearModel:
             if name.effect not in effects:
                 parts = self.parts_at_rest.get(name, np.zeros(len(prior_std)))
                 part = np.sqrt(np.sum((parts[columns] * prior_std[columns]) ** 2))
-                prior_std[i] = np.hypot(self.tolerance(name), part)
+                prior_std[i] = np.hypot(self.tolerances[name], part)
         return prior_std
 
-    def tolerance(self, name: Coefficient) -> float:
+    @cached_property
+    def tolerances(self) -> dict[Coefficient, float]:
+        """Return the standard deviations of the nuisance parameters in a healthy unit."""
+        return {name: self._tolerance(name) for name in self.nuisances}
+
+    def _tolerance(self, name: Coefficient) -> float:
         """
         Return the standard deviation of a nuisance parameter in a healthy unit.
 

@@ -7,8 +7,6 @@ Both are looked for behind the RC filter, where the noise of the sensor is white
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.detection import Detection, detection_of
 from adxl_ros.model import noise
@@ -44,7 +42,7 @@ def residual_detections(
     comparison: BaselineComparison, residual_v: np.ndarray, sensor: Sensor
 ) -> list[Detection]:
     """Find lines and excess noise in a residual, V, (n, m), beside the noise of a sensor."""
-    sensor = replace(sensor, rate_hz=comparison.sensor.rate_hz)
+    sensor = comparison.at_rate(sensor)
     residual_v = bridged(residual_v, comparison.used)
     at_rest = comparison.at_rest & comparison.used
     white = np.diff(_innovations(residual_v, sensor)[0], axis=0)

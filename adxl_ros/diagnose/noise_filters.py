@@ -24,6 +24,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import zip_longest
 from math import sqrt
 from typing import NamedTuple, TYPE_CHECKING
 
@@ -57,10 +59,20 @@ sawtooth of variance 1 is 1 − 6·x + 6·x² after x steps."""
 
 
 def without_pole(values: np.ndarray, pole: float) -> np.ndarray:
-    """Filter series, (..., n), by 1 − aL; the first values stay."""
+    """Filter a series, (n,), by 1 − aL; the first value stays."""
     out = values.copy()
-    out[..., 1:] -= pole * values[..., :-1]
+    out[1:] -= pole * values[:-1]
     return out
+
+
+def in_pairs(series: np.ndarray) -> Iterator[np.ndarray]:
+    """
+    Yield k real series, (k, n), two at a time as the parts of complex numbers, (n,).
+
+    A recursion waits for its last output, so that a complex one takes no longer than a real one.
+    """
+    for real, imaginary in zip_longest(series[::2], series[1::2], fillvalue=0.0):
+        yield np.add(real, 1j * imaginary)
 
 
 @dataclass(frozen=True)
@@ -74,22 +86,24 @@ class AngleErrorFilter:
     weight: np.ndarray  # Change of the predicted sample by the estimate of u, V, (n,)
     scale: np.ndarray  # Standard deviation of the noise divided by that of the innovation, (n,)
 
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n)."""
-        lower = np.ones((2, len(self.gain)), order='F')
+    @cached_property
+    def _recursion(self) -> np.ndarray:
+        """Bands of the matrix that turns estimates of u into what drives them, (2, n)."""
+        lower = np.ones((2, len(self.gain)), complex, order='F')
         lower[1, :-1] = -self.transition[1:]
-        out = np.empty(values.shape)
-        # One by one they stay in the cache.
-        for series, filtered in zip(values, out):
-            changes = without_pole(series, self.pole)
-            changes[0] = 0.0
-            estimates = scipy.linalg.lapack.dtbtrs(
-                lower, changes * self.gain, uplo='L', diag='U', overwrite_b=True
-            )[0]
-            changes[1:] -= estimates[:-1] * self.weight[1:]
-            np.multiply(changes, self.scale, out=filtered)
-            filtered[0] = series[0]
-        return out
+        return lower
+
+    def __call__(self, pair: np.ndarray) -> np.ndarray:
+        """Filter a pair of series, (n,) complex."""
+        changes = without_pole(pair, self.pole)
+        changes[0] = 0.0
+        estimates = scipy.linalg.lapack.ztbtrs(
+            self._recursion, changes * self.gain, uplo='L', diag='U', overwrite_b=True
+        )[0]
+        changes[1:] -= estimates[:-1] * self.weight[1:]
+        changes *= self.scale
+        changes[0] = pair[0]
+        return changes
 
 
 @dataclass(frozen=True)

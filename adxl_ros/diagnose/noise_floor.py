@@ -21,12 +21,14 @@ import numpy as np
 import scipy
 
 _REST_S = 1.0
-"""Length of a rest whose mean is subtracted, s. Chosen: slower changes are part of the gap."""
-_PARTS_OF_REST = 4
-"""Parts of a rest, for the interval of the noise. Chosen: longer than its samples correlate."""
-_FEWEST_PARTS = 20
-"""Parts from which an interval is drawn. Chosen: they show their spread to 16 %."""
-_MOST_PARTS = 100  # Largest number of parts that are drawn. Chosen: run time
+"""Length of a part of a rest whose mean is subtracted, s, to within a half. Chosen: slower changes
+are part of the gap."""
+_PIECES = 4
+"""Pieces of such a part, for the interval of the noise. Chosen: longer than its samples
+correlate."""
+_FEWEST_PIECES = 8
+"""Pieces from which an interval is drawn. Chosen: they show their spread to a quarter."""
+_MOST_PIECES = 100  # Largest number of pieces that are drawn. Chosen: run time
 _FEWEST_SAMPLES = 200  # Fewest samples of an estimate. Chosen: 5 % of the standard deviation
 _REPEAT_SHORTEST_S = 20.0  # Shortest repeat of a trajectory, s. Chosen: a few moves
 _REPEAT_DELAY_S = 10.0
@@ -49,21 +51,26 @@ class NoiseFloor:
     rms_mps2: float  # Noise and the steps of the stage's encoder, m/s²
     # 'still' for rests, 'repeats' of a trajectory, or 'assumed' from the parameter file
     source: str
-    # Sum of the squares of noise and steps by part of the recordings, mean over axes, (m/s²)²,
-    # (k,); of no part where the floor is assumed
+    # Sum of the squares of noise and steps by piece of the recordings, mean over axes, (m/s²)²,
+    # (k,); of no piece where the floor is assumed
     squares: np.ndarray
-    samples: np.ndarray  # Number of samples of each part, (k,)
+    samples: np.ndarray  # Number of samples of each piece, (k,)
 
-    def draws_mps2(self, seed: int, draws: int) -> np.ndarray | None:
-        """Return the floor from parts drawn with replacement, m/s²; None for too few parts."""
+    def power(self, seed: int, draws: int) -> np.ndarray:
+        """
+        Return its mean square, and that of pieces drawn with replacement, (m/s²)², (1 + draws,).
+
+        It is infinite where it is assumed, or of too few pieces to say how sure it is, so that
+        nothing is above it.
+        """
         count = len(self.squares)
-        if count < _FEWEST_PARTS:
-            return None
-        edges = np.linspace(0, count, min(count, _MOST_PARTS) + 1).astype(int)[:-1]
+        if count < _FEWEST_PIECES:
+            return np.full(1 + draws, np.inf)
+        edges = np.linspace(0, count, min(count, _MOST_PIECES) + 1).astype(int)[:-1]
         squares = np.add.reduceat(self.squares, edges)
         samples = np.add.reduceat(self.samples, edges)
         drawn = np.random.default_rng(seed).integers(0, len(edges), (draws, len(edges)))
-        return np.sqrt(squares[drawn].sum(axis=1) / samples[drawn].sum(axis=1))
+        return np.append(self.rms_mps2**2, squares[drawn].sum(axis=1) / samples[drawn].sum(axis=1))
 
 
 class PartSquares(NamedTuple):
@@ -122,18 +129,22 @@ def _encoder_error_mps2(comparison: BaselineComparison) -> float:
 
 
 def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> list[PartSquares]:
-    """Sum the squares of an output, V, (n, m), about the mean of each second at rest."""
-    length = max(round(_REST_S * sensor.rate_hz), 4)
-    # The mean of correlated samples takes more out of their variance than one sample.
-    independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz, sensor.rc_s))
+    """Sum the squares of an output, V, (n, m), about the means of parts of its rests."""
+    usual = max(round(_REST_S * sensor.rate_hz), 4)
     squares: list[PartSquares] = []
     for begin, end in true_runs(at_rest):
-        for first in range(begin, end - length + 1, length):
-            part = volts[first : first + length]
+        # No sample of a rest is lost: its parts are longer or shorter by up to a half.
+        count = round((end - begin) / usual)
+        for part in np.array_split(volts[begin:end], count) if count else ():
+            length = len(part)
+            # The mean of correlated samples takes more out of their variance than one sample.
+            independent = length / float(
+                noise.effective_samples(length, 1 / sensor.rate_hz, sensor.rc_s)
+            )
             squares_v2 = (part - part.mean(axis=0)) ** 2 * length / (length - independent)
             squares += [
                 PartSquares(piece.sum(axis=0), len(piece))
-                for piece in np.array_split(squares_v2, _PARTS_OF_REST)
+                for piece in np.array_split(squares_v2, _PIECES)
             ]
     return squares
 

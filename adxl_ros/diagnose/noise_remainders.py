@@ -11,7 +11,6 @@ repeated samples, the distance of codes, the level of the noise.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -159,7 +158,7 @@ class _Series(NamedTuple):
 
 def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Series:
     """Simulate the recording with noise."""
-    at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
+    at_rate = comparison.at_rate(sensor)
     time_s = comparison.time_s
     volts = comparison.drawn_v(at_rate, seed)
     # What is left out of the recording is left out, and spikes and repeated samples are, too.

@@ -102,11 +102,12 @@ class _FlexibleFunctions:
         unit_v = _FIRST_LEVEL_G * float(sensor.scale_v_per_g[channel.axis])
         rows = np.concatenate([columns.values.T, *(b.T for b in basis.values())])
         rows[1 + len(columns.places) :] *= unit_v
-        plain_mps2 = linear.plain_grams(rows.T, used) / channel.v_per_mean_mps2**2
+        rows *= used
+        plain_mps2 = linear.block_grams(rows) / channel.v_per_mean_mps2**2
         whitener = fits.linearised.filters[number][fits.full.filter_indices[number]]
-        # One by one and in place they take little memory.
-        for row in rows:
-            row[:] = next(linear.white_rows(row[:, None], used, [whitener]))[0]
+        # Two at a time and in place they take little memory.
+        for i in range(0, len(rows), 2):
+            rows[i : i + 2] = next(linear.white_rows(rows[i : i + 2].T, used, [whitener]))
         white_v2 = linear.block_grams(rows)
         fitted_v2 = np.tensordot([fold.fitted for fold in fits.folds], white_v2, 1)
         return cls(

@@ -174,7 +174,7 @@ def linearise(
     # calibration can take up of the effects.
     parts = linear_model.taken_up(changes, 1)
     taken_up = np.array([float(parts[n][0]) if n in parts else 0.0 for n in nuisances])
-    tolerance = np.array([linear_model.tolerance(name) for name in nuisances])
+    tolerance = np.array([linear_model.tolerances[name] for name in nuisances])
     linearised = LinearisedHypothesis(
         effects=tuple(effects),
         sensor=point.sensor,
@@ -229,15 +229,14 @@ class _Point:
         self, comparison: BaselineComparison, baseline_v: np.ndarray
     ) -> Iterator[_Response]:
         """Simulate and differentiate a recording; yield each of its axes."""
-        rate_hz = comparison.sensor.rate_hz
-        sensor = replace(self.sensor, rate_hz=rate_hz)
+        sensor = self.sensor
         output_v = comparison.simulated_v(sensor)
         derivatives = linear.sensitivities_at(
             comparison.simulated_v, sensor, self.names, self.values, output_v
         )
         change_v = output_v - baseline_v
         if self.without is not None:
-            change_v = output_v - comparison.simulated_v(replace(self.without, rate_hz=rate_hz))
+            change_v = output_v - comparison.simulated_v(self.without)
         departures = self.values - self.prior_mean
         for d, axis in enumerate(sensor.axes):
             places = [i for i, name in enumerate(self.names) if name.axis in ('', axis)]
@@ -578,7 +577,7 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
         stays = hints.nuisance and not hints.straight_line and effect not in best.effects
         values[effect] = file_values[effect] if stays else fitted
     comparisons = [
-        replace(c, sensor=replace(best.sensor, values=values, rate_hz=c.sensor.rate_hz))
+        replace(c, sensor=replace(c.at_rate(best.sensor), values=values))
         for c in model.comparisons
     ]
     outputs_v = zip(comparisons, model.baseline_v)

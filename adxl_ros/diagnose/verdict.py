@@ -29,7 +29,6 @@ from adxl_ros.diagnose.weighing import (
     NOTHING,
     SHARE_OF_FORM,
     SimulatedAgain,
-    value_of,
 )
 from adxl_ros.report.quantities import Interval
 import numpy as np
@@ -112,7 +111,8 @@ class Verdict:
     @property
     def remaining(self) -> float:
         """Power beside the best set: what repeats, or all above the noise where that is more."""
-        return max(self.remainder.value, self.left.value, 0.0)
+        is_above = self.left.low > 0
+        return max(self.remainder.value, self.left.value if is_above else 0.0, 0.0)
 
     @property
     def explained_share(self) -> float:
@@ -149,15 +149,15 @@ class _Powers(NamedTuple):
     """What the best set explains and leaves, (m/s²)²."""
 
     explained: float  # Explained power
-    above: float  # What is left above the noise floor, repeating or not
+    above: float  # What is left above the noise floor, repeating or not; 0 if that is not material
     repeats: float  # What repeats beside the set and the drifts; 0 where it is not material
     drift: float  # Power of the first drift
     drifts: Sequence[str]  # The drifts of the noise, the best first
 
-    def remaining(self, material: float) -> float:
-        """Return what is left beside effects: what repeats, or all that no drift explains."""
-        is_more = self.above > material and not self.drifts
-        return max(self.repeats, self.above) if is_more else self.repeats
+    @property
+    def remaining(self) -> float:
+        """What is left beside effects: what repeats, or all that no drift explains."""
+        return self.repeats if self.drifts else max(self.repeats, self.above)
 
 
 def _powers(
@@ -169,8 +169,8 @@ def _powers(
 ) -> _Powers:
     """Weigh what the best set and the noise leave, and drop the drifts where it is none."""
     explained = max(evidence.explained(best), 0.0)
-    left = value_of(evidence.left(best))
-    above = left - of_noise
+    left = evidence.value(evidence.left(best))
+    above = left - of_noise if evidence.is_above_floor(best, of_noise) else 0.0
     repeats = evidence.figure(evidence.mean(found.remainder.squares))
     material = repeats.value if found.repeats and repeats.low > remainder_material else 0.0
     if not found.drifts:
@@ -224,20 +224,20 @@ def _answer(
 ) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
     best, *others = minimal_sets(evidence)
-    material = evidence.material_power(1.0)
     detected = frozenset(cause.effect for cause in in_noise)
     # Only samples that are compared say what is left.
     of_noise = sum(cause.power_mps2 for cause in in_noise if not cause.is_left_out)
     powers = _powers(evidence, best, found, remainder_material, of_noise)
     # A reference that lacks motion leaves more than a floor at rest.
     only_repeats = evidence.fades or not best
-    unexplained = powers.repeats if only_repeats else powers.remaining(material)
+    unexplained = powers.repeats if only_repeats else powers.remaining
     if unexplained > powers.explained + powers.drift + of_noise:
         return _Answer('unknown')
     named = frozenset(() if evidence.wanders else powers.drifts)
     if not best | detected | named:
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
-        is_much = powers.above > max(evidence.floor_mps2**2, material)
+        of_gap = evidence.value(evidence.left(best)) - of_noise
+        is_much = of_gap > max(evidence.floor.values[0], evidence.material_power(1.0))
         return _Answer('unknown' if is_much else 'no_gap')
     groups = _groups(best, _rivals(evidence, best, others, powers))
     certain = best.difference(*groups) | detected
@@ -246,7 +246,7 @@ def _answer(
         certain -= named
     else:
         certain |= named
-    remaining = powers.remaining(material) if best else powers.repeats
+    remaining = powers.remaining if best else powers.repeats
     is_partly = remaining > SHARE_OF_FORM * (powers.explained + remaining)
     if groups and is_partly and not certain:
         # Nothing is named for certain, and none of the rivals explains what repeats.
@@ -283,7 +283,7 @@ def _best_set(
 
     def nats(drifting: Evidence) -> float:
         best = most_probable_set(drifting)
-        return value_of(drifting.drift_nats(best, drifting.noise, healthy))
+        return drifting.value(drifting.drift_nats(best, drifting.noise, healthy))
 
     evidence = simulated(evidence)
     healthy = most_probable_set(evidence)
@@ -322,8 +322,8 @@ def decide(
     """
     found = _best_set(evidence, remainder_of, simulate_again)
     evidence, best, remainder = found.evidence, found.effects, found.remainder
-    power = {d: value_of(evidence.mean(b)) for d, b in remainder.by_dimension.items()}
-    repeats = evidence.interval(evidence.mean(remainder.squares))
+    power = {d: evidence.value(evidence.mean(b)) for d, b in remainder.by_dimension.items()}
+    repeats = evidence.mean(remainder.squares).interval
     # What follows the pose may be of the reference.
     pose = max((power[d] for d in _POSE & {*power}), default=0.0)
     pose_share = float(np.clip(pose / repeats.value, 0.0, 1.0)) if repeats.value > 0 else 0.0
@@ -338,9 +338,9 @@ def decide(
     possible = (answer_of(evidence), _Answer('unknown'), _Answer('no_gap'))
     answer = max(possible, key=lambda a: _support(a, votes))
     probability, hypotheses = _probabilities(answer, votes)
-    highest = max(evidence.interval(evidence.gain(e, NOTHING)).high for e in evidence.candidates)
+    highest = max(evidence.gain(e, NOTHING).interval.high for e in evidence.candidates)
     strongest = sorted(power, key=lambda d: -power[d])
-    tolerated = value_of(evidence.mean(evidence.candidates[NOTHING][HEALTHY].tolerated))
+    tolerated = evidence.value(evidence.mean(evidence.candidates[NOTHING][HEALTHY].tolerated))
     unseen = max(highest, repeats.high, evidence.material_power(1.0))
     return Verdict(
         status=answer.status,
@@ -351,12 +351,12 @@ def decide(
         best=best,
         material_mps2=evidence.material_mps2,
         reference_mps2=evidence.reference_mps2,
-        explained=evidence.interval(evidence.gain(best, NOTHING)),
+        explained=evidence.gain(best, NOTHING).interval,
         remainder=repeats,
-        left=evidence.interval(evidence.left(best)),
+        left=evidence.left(best).interval,
         upper_limit_mps2=(unseen + tolerated) ** 0.5,
         tolerated_mps2=tolerated**0.5,
-        lost_without={e: evidence.interval(evidence.lost_without(best, e)) for e in sorted(best)},
+        lost_without={e: evidence.lost(best, best - {e}).interval for e in sorted(best)},
         remainder_follows=tuple(
             d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2
         ),

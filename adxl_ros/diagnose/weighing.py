@@ -10,9 +10,10 @@ all blocks and each draw of them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, TYPE_CHECKING
+from functools import cached_property, wraps
+from typing import cast, NamedTuple, TYPE_CHECKING, TypeVar
 
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import FormDimension, ProofVariable
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from adxl_ros.diagnose.held_out import HeldOut, HeldOutFits
     from adxl_ros.diagnose.remainder import Remainder
 
+_T = TypeVar('_T', bound='Callable[..., ByDraw]')
 HEALTHY = ''  # The drift of a healthy unit's noise
 _SHARE_OF_SET = 0.03
 """Share of the explained power that a drift beside exact effects must hold. Chosen: a sixth of the
@@ -48,13 +50,25 @@ _SHOWN_BY_POSE = {
 """Variables over which an effect that only changes with the pose shows."""
 NOTHING: frozenset[str] = frozenset()
 """The set without effects: the baseline."""
-ByDraw = np.ndarray
-"""A figure by draw of the blocks, (draws,); the first one is its value, the others its scatter."""
 
 
-def value_of(figure: ByDraw) -> float:
-    """Return what the rule is applied to: the first value of a figure by draw."""
-    return float(figure[0])
+@dataclass(frozen=True, eq=False)
+class ByDraw:
+    """A figure of all blocks, and of each draw of them."""
+
+    values: np.ndarray  # Of all blocks, then of each draw, (1 + draws,)
+
+    @cached_property
+    def low(self) -> float:
+        """Lower end of its interval."""
+        return float(np.quantile(self.values, _LOWEST))
+
+    @property
+    def interval(self) -> Interval:
+        """The value of all blocks with the interval of the draws."""
+        value = float(self.values[0])
+        low, high = np.quantile(self.values[1:], [_LOWEST, _HIGHEST], method='nearest')
+        return Interval(value, min(float(low), value), max(float(high), value))
 
 
 class SimulatedAgain(NamedTuple):
@@ -80,6 +94,19 @@ class Figure(NamedTuple):
         return self.value > _NATS and self.low > 0
 
 
+def _once(method: _T) -> _T:
+    """Keep a figure, which all draws ask for."""
+
+    @wraps(method)
+    def kept(evidence: Evidence, *args: object) -> ByDraw:
+        key = (method.__name__, evidence.noise, *args)
+        if key not in evidence._known:
+            evidence._known[key] = method(evidence, *args)
+        return evidence._known[key]
+
+    return cast(_T, kept)
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the rule weighs: all blocks, with draws of them for the intervals, or one draw."""
@@ -95,35 +122,50 @@ class Evidence:
     errs_in_motion: bool  # Whether it errs in motion, too, as a robot does
     fades: bool  # Whether the reference lacks motion
     wanders: bool  # Whether the reference may drift slowly, so that no drift is of the sensor
-    floor_mps2: float  # Noise floor, m/s²; infinite where it is assumed
+    # Noise floor by draw of its own pieces, (m/s²)²; infinite where nobody knows how sure it is
+    floor: ByDraw
     # Effects of each set none of whose sizes differs from 0
     sizeless: Mapping[frozenset[str], frozenset[str]] = field(default_factory=dict)
     # The sets that could be the answer, simulated again, not linearised
     again: Mapping[frozenset[str], SimulatedAgain] = field(default_factory=dict)
-    is_draw: bool = False  # Whether it is one draw, whose figures have no interval
+    number: int = 0  # Number of the draw; 0 for all blocks
     noise: str = HEALTHY  # The drift in whose noise sets are compared
+    _known: dict[tuple, ByDraw] = field(default_factory=dict)  # Figures that were asked for
 
     def draw(self, number: int) -> Evidence:
         """Return one draw of the blocks."""
-        return replace(self, weights=self.weights[number : number + 1], is_draw=True)
+        return replace(self, number=number)
+
+    def value(self, draws: ByDraw) -> float:
+        """Return the value of a figure."""
+        return float(draws.values[self.number])
 
     def figure(self, draws: ByDraw) -> Figure:
         """Return what the rule weighs of a figure."""
-        value = value_of(draws)
-        return Figure(value, value if self.is_draw else float(np.quantile(draws, _LOWEST)))
+        value = self.value(draws)
+        return Figure(value, value if self.number else draws.low)
 
     def left(self, effects: frozenset[str]) -> ByDraw:
         """Return the power above the noise floor that a set leaves."""
-        return self.mean(self.candidates[effects][HEALTHY].figures.squares) - self.floor_mps2**2
+        return ByDraw(self.squares(effects).values - self.floor.values)
+
+    def is_above_floor(self, effects: frozenset[str], of_noise: float) -> bool:
+        """Determine whether a set leaves materially more than the noise floor can be."""
+        left = self.figure(self.squares(effects)).low - self.floor.interval.high
+        return left - of_noise > self.material_power(1.0)
 
     def material_power(self, pose_share: float) -> float:
         """Return the power that a user would act on and that is not of the reference, (m/s²)²."""
         share = 1.0 if self.errs_in_motion else pose_share
         return self.material_mps2**2 + share * self.reference_mps2**2
 
+    def sum(self, by_block: np.ndarray) -> ByDraw:
+        """Return a sum over blocks."""
+        return ByDraw(self.weights @ by_block)
+
     def mean(self, by_block: np.ndarray) -> ByDraw:
         """Return the mean over samples of sums by block."""
-        return self.weights @ by_block / np.maximum(self.weights @ self.counts, 1.0)
+        return ByDraw(self.weights @ by_block / np.maximum(self.weights @ self.counts, 1.0))
 
     def is_refuted(self, effects: frozenset[str]) -> bool:
         """
@@ -147,8 +189,13 @@ class Evidence:
         """Determine whether a set, as it is printed, leaves materially more than another."""
         if not {effects, other} <= {*self.again}:
             return False
-        more = self.figure(self.mean(self.again[effects].printed - self.again[other].printed))
+        more = self.figure(self._more_as_printed(effects, other))
         return more.value > self.material_power(1.0) and more.low > 0
+
+    @_once
+    def _more_as_printed(self, effects: frozenset[str], other: frozenset[str]) -> ByDraw:
+        """Return the power that a set, as it is printed, leaves more than another."""
+        return self.mean(self.again[effects].printed - self.again[other].printed)
 
     def follows(self, remainder: Remainder, dimensions: Collection[str]) -> bool:
         """
@@ -157,88 +204,111 @@ class Evidence:
         Each function of each axis is one more that might by chance.
         """
         tried = [row for d in dimensions for row in remainder.nats.get(d, ())]
-        figures = [self.figure(self.weights @ row) for row in tried]
+        figures = [self.figure(self.sum(row)) for row in tried]
         smallest = _NATS + np.log(max(len(tried), 1))
         return any(figure.value > smallest and figure.low > 0 for figure in figures)
 
+    @_once
+    def squares(self, effects: frozenset[str]) -> ByDraw:
+        """Return the power that a set leaves, in healthy noise."""
+        return self.mean(self.candidates[effects][HEALTHY].figures.squares)
+
+    @_once
     def gain(self, more: frozenset[str], less: frozenset[str]) -> ByDraw:
         """Return by how much one set explains more power than another."""
         return self.mean(self._figures(less).squares - self._figures(more).squares)
 
     def explained(self, effects: frozenset[str]) -> float:
         """Return the power that a set explains."""
-        return value_of(self.gain(effects, NOTHING))
+        return self.value(self.gain(effects, NOTHING))
 
-    def lost_without(self, effects: frozenset[str], effect: str) -> ByDraw:
+    @_once
+    def lost(self, effects: frozenset[str], part: frozenset[str]) -> ByDraw:
         """
-        Return what a set explains less without an effect.
+        Return what a part of a set explains less.
 
-        Beside a drift the squares scatter as it does: what the effect changes is the figure.
+        Beside a drift the squares scatter as it does, and the figure is by how much predictions
+        differ.
         """
-        drifting = self.candidates[effects].get(self.noise)
-        if self.noise == HEALTHY or drifting is None:
-            return self.gain(effects, effects - {effect})
-        return self.mean(drifting.changes[effect])
+        if self.noise == HEALTHY:
+            return self.gain(effects, part)
+        return self.mean(self._fits(effects).squares_between(self._fits(part)))
 
+    @_once
     def nats(self, more: frozenset[str], less: frozenset[str]) -> ByDraw:
         """Return by how much a set makes held-out samples more probable."""
         gained = self._figures(more).log_likelihood - self._figures(less).log_likelihood
-        return self.weights @ gained
+        return self.sum(gained)
 
+    @_once
     def drift_nats(self, effects: frozenset[str], drift: str, healthy: frozenset[str]) -> ByDraw:
         """Return by how much a set and a drift are likelier than a set in healthy noise."""
         drifting = self.candidates[effects][drift].figures
         steady = self.candidates[healthy][HEALTHY].figures
-        return self.weights @ (drifting.log_likelihood - steady.log_likelihood)
+        return self.sum(drifting.log_likelihood - steady.log_likelihood)
 
     def is_beyond_form(self, effects: frozenset[str], others: frozenset[str]) -> bool:
         """Determine whether a set explains materially more than others with errors of form."""
         # No error of form holds a tenth of the power, and most effects of a set hold more.
-        (effect,) = effects - others
-        lost = value_of(self.lost_without(effects, effect))
-        if lost > SHARE_OF_FORM * self.explained(effects):
+        if self.value(self.lost(effects, others)) > SHARE_OF_FORM * self.explained(effects):
             return True
         # A weak effect that all blocks do not show is not looked for in draws of them.
-        if self.is_draw and others not in self._fits(effects).beside_errors:
+        if self.number and others not in self._fits(effects).beside_errors:
             return False
-        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
-        gained = self.figure(self.weights @ (more.log_likelihood - less.log_likelihood))
-        lost = value_of(self.mean(less.squares - more.squares))
+        gained = self.figure(self._nats_beside_form(effects, others))
+        lost = self.value(self._lost_beside_form(effects, others))
         return gained.predicts and lost > self.material_mps2**2
 
+    @_once
+    def _nats_beside_form(self, effects: frozenset[str], others: frozenset[str]) -> ByDraw:
+        """Return by how much a set is likelier than others with errors of form."""
+        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
+        return self.sum(more.log_likelihood - less.log_likelihood)
+
+    @_once
+    def _lost_beside_form(self, effects: frozenset[str], others: frozenset[str]) -> ByDraw:
+        """Return what others with errors of form explain less."""
+        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
+        return self.mean(less.squares - more.squares)
+
     def _fits(self, effects: frozenset[str]) -> HeldOutFits:
-        """Return the fits of a set in the present noise, or in healthy noise without it."""
-        fits = self.candidates[effects]
-        return fits[self.noise if self.noise in fits else HEALTHY]
+        """Return the fits of a set in the present noise."""
+        return self.candidates[effects][self.noise]
 
     def _figures(self, effects: frozenset[str]) -> HeldOut:
-        """Return the figures of a set in the present noise, or in healthy noise without it."""
+        """Return the figures of a set in the present noise."""
         return self._fits(effects).figures
 
-    def interval(self, draws: ByDraw) -> Interval:
-        """Return the value of all blocks with the interval of the draws."""
-        value = value_of(draws)
-        low, high = np.quantile(draws[1:], [_LOWEST, _HIGHEST], method='nearest')
-        return Interval(value, min(float(low), value), max(float(high), value))
 
-
-def _is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
-    """Determine whether a set loses a material part of what it explains without an effect."""
-    others = effects - {effect}
-    if effect in evidence.sizeless.get(effects, ()) or others not in evidence.candidates:
-        return False
-    lost = evidence.figure(evidence.lost_without(effects, effect))
-    nats = evidence.figure(evidence.nats(effects, others))
+def _is_shown_by_pose(effect: str) -> bool:
+    """Return whether an effect only changes with the pose."""
     proof = {*effect_named(effect).diagnosis.proof}
-    by_pose = bool(proof) and proof <= _SHOWN_BY_POSE
-    is_certain = nats.value > _NATS and max(nats.low, lost.low) > 0
-    return is_certain and lost.value > evidence.material_power(float(by_pose))
+    return bool(proof) and proof <= _SHOWN_BY_POSE
+
+
+def _loses(evidence: Evidence, effects: frozenset[str], part: frozenset[str]) -> bool:
+    """Determine whether a part of a set explains materially less."""
+    lost = evidence.figure(evidence.lost(effects, part))
+    nats = evidence.figure(evidence.nats(effects, part))
+    by_pose = all(map(_is_shown_by_pose, effects - part))
+    # Beside a drift, what is lost is a square, which is never below 0.
+    is_certain = nats.low > 0 or (evidence.noise == HEALTHY and lost.low > 0)
+    is_material = lost.value > evidence.material_power(float(by_pose))
+    return nats.value > _NATS and is_certain and is_material
 
 
 def _is_minimal(evidence: Evidence, effects: frozenset[str]) -> bool:
-    """Determine whether all effects of a set are needed, beyond errors of form of the others."""
-    return all(_is_needed(evidence, effects, e) for e in effects) and all(
-        evidence.is_beyond_form(effects, effects - {e}) for e in effects
+    """
+    Determine whether all effects of a set are needed, beyond errors of form of the others.
+
+    No smaller part of a set may be better than a larger one: it would be the one to beat.
+    """
+    without_one = [effects - {e} for e in effects]
+    if evidence.sizeless.get(effects) or not {*without_one} <= {*evidence.candidates}:
+        return False
+    parts = [part for part in evidence.candidates if part < effects]
+    return all(_loses(evidence, effects, part) for part in parts) and all(
+        evidence.is_beyond_form(effects, part) for part in without_one
     )
 
 
@@ -254,7 +324,7 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
         for effects in evidence.candidates
         if _is_minimal(evidence, effects) and not evidence.is_refuted(effects)
     ]
-    kept.sort(key=lambda effects: -value_of(evidence.nats(effects, NOTHING)))
+    kept.sort(key=lambda effects: -evidence.value(evidence.nats(effects, NOTHING)))
     first = kept[0]
     alternatives = [first]
     for other in kept[1:]:
@@ -274,11 +344,12 @@ def drifts_beside(evidence: Evidence, effects: frozenset[str]) -> list[str]:
     """Return the drifts, the best first, that make samples beside a set more probable."""
     tried = [d for d in evidence.candidates[effects] if d != HEALTHY]
     nats = {d: evidence.drift_nats(effects, d, effects) for d in tried}
-    drifts = sorted(nats, key=lambda d: -value_of(nats[d]))
+    drifts = sorted(nats, key=lambda d: -evidence.value(nats[d]))
     if not drifts or not evidence.figure(nats[drifts[0]]).predicts:
         return []
-    best = nats[drifts[0]]
-    return [d for d in drifts if not evidence.figure(best - nats[d]).predicts]
+    best = nats[drifts[0]].values
+    less = {d: evidence.figure(ByDraw(best - nats[d].values)) for d in drifts}
+    return [d for d in drifts if not less[d].predicts]
 
 
 def is_drifting(evidence: Evidence, effects: frozenset[str], healthy: frozenset[str]) -> bool:

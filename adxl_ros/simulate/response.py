@@ -238,9 +238,10 @@ class Response:
         aligned = bool(np.abs(steps - nearest).max() < _ALIGNED_STEPS)
         until = int(nearest[-1]) + 1 + (0 if aligned else POINTS // 2)
         every = round(1 / (self.sensor.rate_hz * self._step_s))
-        if self._is_whole and aligned and not np.any(nearest % every):
+        number = nearest / every
+        if self._is_whole and aligned and np.array_equal(number, np.rint(number)):
             signals = self._advance(until, every)
-            return self._grid.at((nearest / every).astype(np.intp)), signals
+            return self._grid.at(number.astype(np.intp)), signals
         signals = self._advance(until)
         while self._grid.end < until:  # a gap, without samples
             signals = self._advance(until)
@@ -356,11 +357,12 @@ class Response:
 
         Noise of missing samples is drawn, too, as far back as the filter remembers.
         """
+        density = self.sensor.noise_density_g_per_rthz
+        if not density.any():
+            return np.zeros((len(density), len(stamps_s))).T
         rc_s = np.array(signals.rc_s)
         rate_hz = self.sensor.rate_hz
         std_v = noise.analog_std_v(self.sensor)
-        if not std_v.any():
-            return np.zeros((len(std_v), len(stamps_s))).T
         decay = np.array([np.exp(-1 / (rate_hz * rc)) if rc else 0.0 for rc in rc_s])
         passed = np.rint(np.diff(stamps_s, prepend=self._last_s) * rate_hz).astype(np.intp)
         passed = np.clip(passed, 1, 1 + ceil(_NOISE_MEMORY * rc_s.max() * rate_hz))

@@ -60,8 +60,7 @@ gap = adxl.diagnose(recording(logged_mps2), 'adxl355', sim=recording(simulated_m
 print(gap)
 
 # %% [markdown]
-# The sizes, and what is left of the gap in a simulation that has them. Beside the askew board, the
-# filter or the delay of the log are not what is assumed at 200 Hz; the two are not separated.
+# The sizes, and what is left of the gap in a simulation that has them.
 
 # %%
 for effect in gap.effects:

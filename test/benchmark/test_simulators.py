@@ -141,9 +141,6 @@ def after_step(tmp_path_factory: pytest.TempPathFactory) -> Checked:
     return checked(runpy.run_path(str(path))['AfterStep'], tmp_path_factory.mktemp('mujoco'))
 
 
-@pytest.mark.xfail(
-    strict=True, reason='the integrator, 1.2 mg, is named vibration_rectification before the delay'
-)
 def test_the_delay_of_mujoco_is_the_largest_cause(after_step: Checked) -> None:
     assert after_step.named[0].startswith('time_offset: offset 2.')
 

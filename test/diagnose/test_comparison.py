@@ -48,6 +48,16 @@ def test_the_residual_is_recording_minus_simulation(compared):
     assert residual_mps2 == pytest.approx(GAP_MPS2)
 
 
+def test_the_search_has_the_filter_of_the_recording():
+    """A digital filter follows the rate of the sensor, not that of the searched samples."""
+    sensor = replace(unit(), rate_hz=500.0, filter_rate_hz=125.0)
+    comparison = beside.compare(simulated(sensor, motion=turning()), sensor)
+    searched = beside.at_search_rate(comparison)
+    of_search_v = comparison.simulated_v(sensor)[::4]
+    assert len(searched) == len(of_search_v)
+    assert searched.simulated_v(sensor) == pytest.approx(of_search_v, abs=1e-5)
+
+
 def test_without_a_reference_only_changes_are_compared():
     """The pose is unknown, so that the mean of the residual says nothing."""
     sensor = unit()

@@ -33,13 +33,28 @@ def test_the_interval_contains_the_noise(seconds):
         samples = np.array([part.samples for part in sums])
         rms = np.sqrt(squares.sum() / samples.sum())
         floor = NoiseFloor(np.array([rms]), rms, 'still', squares, samples)
-        low, high = np.quantile(floor.draws_mps2(seed, 200), [0.05, 0.95])
+        low, high = np.quantile(floor.power(seed, 200), [0.05, 0.95])
         contained += low < 1.0 < high
     assert (0.8 if seconds < 20 else 0.84) < contained / _TRIALS < 0.95
 
 
-def test_a_few_seconds_have_no_interval():
-    assert NoiseFloor(np.ones(1), 1.0, 'still', *np.ones((2, 19))).draws_mps2(0, 200) is None
+def test_a_second_has_no_interval():
+    assert np.isinf(NoiseFloor(np.ones(1), 1.0, 'still', *np.ones((2, 7))).power(0, 200)).all()
+
+
+@pytest.mark.parametrize('seconds', [0.6, 1.4, 2.7])
+def test_no_sample_of_a_rest_is_lost(seconds):
+    """The parts of a rest have all of its samples, and their mean square is that of the noise."""
+    sensor = nominal(rate_hz=_RATE_HZ)
+    count = round(seconds * _RATE_HZ)
+    at_rest = np.arange(400 * (count + 1)) % (count + 1) < count
+    white = np.random.default_rng(1).normal(size=(len(at_rest), 1))
+    pole = np.exp(-1 / (_RATE_HZ * sensor.rc_s))
+    volts = lfilter([np.sqrt(1 - pole**2)], [1, -pole], white, axis=0)
+    sums = squares_at_rest(volts, at_rest, sensor)
+    assert sum(part.samples for part in sums) == at_rest.sum()
+    squares = sum(part.squares_v2[0] for part in sums)
+    assert squares / at_rest.sum() == pytest.approx(1.0, rel=0.03)
 
 
 @pytest.mark.parametrize('steps', [0.02, 0.1, 0.2, 0.3])

@@ -290,4 +290,4 @@ def test_reading_is_quick(long_csv: Path) -> None:
 
 
 def test_the_memory_of_reading_is_bounded(long_csv: Path) -> None:
-    assert growth_mb(long_csv) < 10
+    assert growth_mb(long_csv) < 2

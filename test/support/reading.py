@@ -12,14 +12,17 @@ from adxl_ros.files import recording
 import pytest
 
 GROWTH = """
-from resource import getrusage, RUSAGE_SELF
 import sys
+from tracemalloc import get_traced_memory, start
 from adxl_ros.files import recording
-peaks_kb = []
+start()
+peaks = []
 for block in recording.blocks(sys.argv[1], 5000):
-    peaks_kb.append(getrusage(RUSAGE_SELF).ru_maxrss)
-print(peaks_kb[-1] - peaks_kb[len(peaks_kb) // 4])
+    peaks.append(get_traced_memory()[1])
+print((peaks[-1] - peaks[len(peaks) // 4]) / 1024)
 """
+"""Growth of the highest memory that Python and numpy hold, KiB: that of the process has steps of
+many MiB, and begins with that of its parent."""
 
 
 def refusal(path: Path) -> str:
