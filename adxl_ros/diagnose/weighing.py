@@ -301,10 +301,13 @@ def _is_minimal(evidence: Evidence, effects: frozenset[str]) -> bool:
     """
     Determine whether all effects of a set are needed, beyond errors of form of the others.
 
-    No smaller part of a set may be better than a larger one: it would be the one to beat.
+    No smaller part of a set may be better than a larger one: it would be the one to beat. Nor may
+    a set predict worse than nothing, however likely a drift makes it.
     """
     without_one = [effects - {e} for e in effects]
     if evidence.sizeless.get(effects) or not {*without_one} <= {*evidence.candidates}:
+        return False
+    if effects and evidence.explained(effects) <= 0:
         return False
     parts = [part for part in evidence.candidates if part < effects]
     return all(_loses(evidence, effects, part) for part in parts) and all(
