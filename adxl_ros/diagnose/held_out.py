@@ -144,7 +144,7 @@ class HeldOutFits:
 
     @cached_property
     def _left_v(self) -> list[np.ndarray]:
-        """What is left of the held-out samples of each channel, V, (n,)."""
+        """Return what is left of the held-out samples of each channel, V, (n,)."""
         every = []
         for columns in self.linearised.columns:
             values = columns.values

@@ -156,7 +156,7 @@ class _Powers(NamedTuple):
 
     @property
     def remaining(self) -> float:
-        """What is left beside effects: what repeats, or all that no drift explains."""
+        """Return what is left beside effects: what repeats, or all that no drift explains."""
         return self.repeats if self.drifts else max(self.repeats, self.above)
 
 

@@ -65,7 +65,7 @@ class ByDraw:
 
     @property
     def interval(self) -> Interval:
-        """The value of all blocks with the interval of the draws."""
+        """Return the value of all blocks with the interval of the draws."""
         value = float(self.values[0])
         low, high = np.quantile(self.values[1:], [_LOWEST, _HIGHEST], method='nearest')
         return Interval(value, min(float(low), value), max(float(high), value))
@@ -159,7 +159,7 @@ class Evidence:
         share = 1.0 if self.errs_in_motion else pose_share
         return self.material_mps2**2 + share * self.reference_mps2**2
 
-    def sum(self, by_block: np.ndarray) -> ByDraw:
+    def total(self, by_block: np.ndarray) -> ByDraw:
         """Return a sum over blocks."""
         return ByDraw(self.weights @ by_block)
 
@@ -204,7 +204,7 @@ class Evidence:
         Each function of each axis is one more that might by chance.
         """
         tried = [row for d in dimensions for row in remainder.nats.get(d, ())]
-        figures = [self.figure(self.sum(row)) for row in tried]
+        figures = [self.figure(self.total(row)) for row in tried]
         smallest = _NATS + np.log(max(len(tried), 1))
         return any(figure.value > smallest and figure.low > 0 for figure in figures)
 
@@ -238,14 +238,14 @@ class Evidence:
     def nats(self, more: frozenset[str], less: frozenset[str]) -> ByDraw:
         """Return by how much a set makes held-out samples more probable."""
         gained = self._figures(more).log_likelihood - self._figures(less).log_likelihood
-        return self.sum(gained)
+        return self.total(gained)
 
     @_once
     def drift_nats(self, effects: frozenset[str], drift: str, healthy: frozenset[str]) -> ByDraw:
         """Return by how much a set and a drift are likelier than a set in healthy noise."""
         drifting = self.candidates[effects][drift].figures
         steady = self.candidates[healthy][HEALTHY].figures
-        return self.sum(drifting.log_likelihood - steady.log_likelihood)
+        return self.total(drifting.log_likelihood - steady.log_likelihood)
 
     def is_beyond_form(self, effects: frozenset[str], others: frozenset[str]) -> bool:
         """Determine whether a set explains materially more than others with errors of form."""
@@ -263,7 +263,7 @@ class Evidence:
     def _nats_beside_form(self, effects: frozenset[str], others: frozenset[str]) -> ByDraw:
         """Return by how much a set is likelier than others with errors of form."""
         more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
-        return self.sum(more.log_likelihood - less.log_likelihood)
+        return self.total(more.log_likelihood - less.log_likelihood)
 
     @_once
     def _lost_beside_form(self, effects: frozenset[str], others: frozenset[str]) -> ByDraw:
@@ -301,13 +301,10 @@ def _is_minimal(evidence: Evidence, effects: frozenset[str]) -> bool:
     """
     Determine whether all effects of a set are needed, beyond errors of form of the others.
 
-    No smaller part of a set may be better than a larger one: it would be the one to beat. Nor may
-    a set predict worse than nothing, however likely a drift makes it.
+    No smaller part of a set may be better than a larger one: it would be the one to beat.
     """
     without_one = [effects - {e} for e in effects]
     if evidence.sizeless.get(effects) or not {*without_one} <= {*evidence.candidates}:
-        return False
-    if effects and evidence.explained(effects) <= 0:
         return False
     parts = [part for part in evidence.candidates if part < effects]
     return all(_loses(evidence, effects, part) for part in parts) and all(
