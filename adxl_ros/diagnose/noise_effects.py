@@ -10,7 +10,7 @@ from __future__ import annotations
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.detection import Detection, detection_of
 from adxl_ros.model import noise
-from adxl_ros.model.constants import MAD_TO_STD
+from adxl_ros.model.constants import MAD_TO_STD, Z_90
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import bridged
@@ -33,7 +33,11 @@ _LINE_BESIDE = 4.0
 """Distance at which the power beside a line is taken, in inverse parts. Chosen: beyond the main
 lobe of the window."""
 NOISE_EXCESS = 1.2
-"""Noise, divided by the stated noise, from which it is excessive. Chosen: units differ by less."""
+"""Noise, divided by the stated noise, from which it is excessive, beyond its interval. Chosen:
+units differ by less."""
+_MEDIAN_SCATTER = 1.166
+"""Relative standard deviation of a level by the median of n magnitudes, times √n: of normal ones,
+1/(4·φ(z)·z), z = 0.6745."""
 _RESTING_FEWEST = 500
 """Fewest resting samples that show excess noise. Chosen: a standard deviation of 3 %."""
 
@@ -89,7 +93,10 @@ def _excess(
         recorded_v = np.std(residual_v[rows], axis=0)
         drawn_v = np.std(simulated_v[rows], axis=0)
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
-    if np.max(ratio) <= NOISE_EXCESS:
+    # Both levels scatter.
+    scatter = np.sqrt(2 / np.count_nonzero(rows)) * _MEDIAN_SCATTER
+    surely = ratio * (1 - Z_90 * scatter)
+    if np.max(surely) <= NOISE_EXCESS:
         return None
     power_v2 = np.maximum(ratio**2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2
     return detection_of(Detector.NOISE_LEVEL, power_v2, sensor, ratio=ratio - 1)

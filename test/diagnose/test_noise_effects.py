@@ -5,7 +5,9 @@
 from dataclasses import replace
 
 from adxl_ros.diagnose import noise_effects, noise_remainders, sample_faults
+from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.noise_remainders import NoiseRemainder
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import with_neutral, with_values
 from adxl_ros.model.signal_chain import quantise
@@ -205,3 +207,19 @@ def test_a_detection_states_its_mean_square():
     step_v = 2 * made.lsb_v
     found = sample_faults.coarse_codes(np.rint(white_v(20 * step_v) / step_v) * step_v, made)
     assert found.power_mps2 == pytest.approx((9.80665 * step_v) ** 2 / 12, rel=1e-6)
+
+
+@pytest.mark.parametrize(('ratio', 'fewest', 'most'), [(1.15, 0, 2), (1.6, 40, 40)])
+def test_noise_is_excessive_beyond_the_interval_of_its_level(ratio, fewest, most):
+    """Units differ by up to a fifth; ten seconds show a level to some per cent."""
+    healthy = sensor()
+    noisier = replace(healthy, noise_density_g_per_rthz=ratio * healthy.noise_density_g_per_rthz)
+    at_rest = Recording(
+        'rest', TIME_S[:1000], dict.fromkeys(('x_v', 'y_v'), 2.5 + 0 * TIME_S[:1000])
+    )
+    comparison = compare(at_rest, healthy)
+    found = 0
+    for seed in range(40):
+        residual_v = comparison.simulated_noise_v(noisier, seed + 1)
+        found += bool(noise_effects.residual_detections(comparison, residual_v, healthy))
+    assert fewest <= found <= most
