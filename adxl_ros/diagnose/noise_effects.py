@@ -95,8 +95,7 @@ def _excess(
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
     # Both levels scatter.
     scatter = np.sqrt(2 / np.count_nonzero(rows)) * _MEDIAN_SCATTER
-    surely = ratio * (1 - Z_90 * scatter)
-    if np.max(surely) <= NOISE_EXCESS:
+    if np.max(ratio) * (1 - Z_90 * scatter) <= NOISE_EXCESS:
         return None
     power_v2 = np.maximum(ratio**2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2
     return detection_of(Detector.NOISE_LEVEL, power_v2, sensor, ratio=ratio - 1)

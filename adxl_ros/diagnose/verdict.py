@@ -111,8 +111,8 @@ class Verdict:
     @property
     def remaining(self) -> float:
         """Power beside the best set: what repeats, or all above the noise where that is more."""
-        is_above = self.left.low > 0
-        return max(self.remainder.value, self.left.value if is_above else 0.0, 0.0)
+        above = self.left.value if self.left.low > 0 else 0.0
+        return max(self.remainder.value, above)
 
     @property
     def explained_share(self) -> float:
