@@ -58,7 +58,7 @@ def electronics(sensor: Sensor) -> Electronics:
     return Electronics(
         rc_s=by_axis(signals.rc_s[:count]),
         noise_ratio=by_axis(signals.noise_ratio[:count]),
-        lsb_v=by_axis(signals.lsb_v * np.array(signals.lsb_ratio)),
+        lsb_v=by_axis(signals.lsb_v),
     )
 
 

@@ -130,8 +130,7 @@ class Chain:
             signals.scale_v_per_g = self._scale_v_per_g[:]
             signals.rc_s = [sensor.rc_s] * count
             signals.noise_ratio = [1.0] * count
-            signals.lsb_v = sensor.lsb_v
-            signals.lsb_ratio = [1.0] * count
+            signals.lsb_v = [sensor.lsb_v] * count
         elif place is Place.ADC:
             signals.volts = list(signals.input_v)
         for effect in self.effects[place]:
@@ -201,7 +200,7 @@ class Chain:
         coded = quantise(
             np.moveaxis(np.array(signals.volts), 0, -1),
             self.sensor,
-            signals.lsb_v * np.array(signals.lsb_ratio),
+            np.array(signals.lsb_v),
         )
         if not self.effects[Place.CODE]:
             return coded

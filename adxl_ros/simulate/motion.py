@@ -10,10 +10,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
 
-from adxl_ros.errors import UserError
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Components, Need
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.effects.base import Components
 from adxl_ros.simulate.smoothed_path import PathErrors
 from adxl_ros.wording import option
 import numpy as np
@@ -121,30 +118,6 @@ def lagrange_weights(position: np.ndarray) -> np.ndarray:
     return np.column_stack(
         [np.prod([(position - k) / (j - k) for k in nodes if k != j], axis=0) for j in nodes]
     )
-
-
-def check_needs(sensor: Sensor, motion: Motion) -> None:
-    """Refuse an effect that has nothing to act on."""
-    has_stage = motion.force is None
-    is_robot = getattr(motion.force, 'is_robot', False)
-    has_steps = any(np.any(values.get('step_v')) for values in sensor.values.values())
-    missing = {
-        Need.STAGE: (has_stage, 'this manoeuvre has none, only specific force'),
-        Need.ROTATION: (has_stage or is_robot, 'it is not known beside a specific force'),
-        Need.ROBOT: (is_robot, f'the motion is not that of a robot; give {option("urdf")}'),
-        Need.ADC: (sensor.adc_bits or has_steps, 'the sensor has none: sensor.adc_bits is 0'),
-        Need.NOISE: (
-            np.any(sensor.noise_density_g_per_rthz),
-            'the sensor has none: sensor.noise_density_g_per_rthz is 0',
-        ),
-    }
-    for name in sensor.effects:
-        for need in effect_named(name).needs:
-            is_there, reason = missing.get(need, (True, ''))
-            if not is_there:
-                raise UserError(
-                    f'{name} acts on the {need.value}, but {reason}; leave the effect out'
-                )
 
 
 class ForcePath:

@@ -11,6 +11,7 @@ from itertools import chain
 from math import ceil
 from typing import Any, NamedTuple
 
+from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording, REFERENCES
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
@@ -31,7 +32,6 @@ from adxl_ros.model.sensor import neutral, Sensor
 from adxl_ros.model.signal_chain import Chain
 from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import (
-    check_needs,
     encoder_reading,
     ForcePath,
     Held,
@@ -40,6 +40,7 @@ from adxl_ros.simulate.motion import (
     Path,
     POINTS,
 )
+from adxl_ros.wording import option
 import numpy as np
 
 Columns = dict[str, np.ndarray]  # Columns of a recording by canonical name, (n,) each
@@ -414,6 +415,32 @@ class ChainMemo:
         if len(kept) > self._most:
             del kept[next(iter(kept))]
         return result
+
+
+def check_needs(sensor: Sensor, motion: Motion) -> None:
+    """Refuse an effect that has nothing to act on."""
+    has_stage = motion.force is None
+    is_robot = getattr(motion.force, 'is_robot', False)
+    missing = {
+        Need.STAGE: (has_stage, 'this manoeuvre has none, only specific force'),
+        Need.ROTATION: (has_stage or is_robot, 'it is not known beside a specific force'),
+        Need.ROBOT: (is_robot, f'the motion is not that of a robot; give {option("urdf")}'),
+        Need.ADC: (
+            sensor.adc_bits or noise.electronics(sensor).lsb_v.any(),
+            'the sensor has none: sensor.adc_bits is 0',
+        ),
+        Need.NOISE: (
+            np.any(sensor.noise_density_g_per_rthz),
+            'the sensor has none: sensor.noise_density_g_per_rthz is 0',
+        ),
+    }
+    for name in sensor.effects:
+        for need in effect_named(name).needs:
+            is_there, reason = missing.get(need, (True, ''))
+            if not is_there:
+                raise UserError(
+                    f'{name} acts on the {need.value}, but {reason}; leave the effect out'
+                )
 
 
 def step_s(sensor: Sensor, motion: Motion) -> float:

@@ -34,7 +34,8 @@ from adxl_ros.model.signal_chain import Chain
 from adxl_ros.report.arguments import require_number, require_whole
 from adxl_ros.simulate.gyroscope_model import GyroscopeModel
 from adxl_ros.simulate.host_arrays import chosen, like, of_each, on_host
-from adxl_ros.simulate.motion import check_needs, lagrange_weights, Motion, POINTS
+from adxl_ros.simulate.motion import lagrange_weights, Motion, POINTS
+from adxl_ros.simulate.response import check_needs
 import numpy as np
 from scipy.special import ndtr, ndtri
 

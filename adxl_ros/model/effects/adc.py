@@ -191,9 +191,8 @@ def adc_inl(signals: Signals, p: Parameters) -> None:
 def quantisation(signals: Signals, p: Parameters) -> None:
     """Quantisation that is coarser than the resolution of the ADC."""
     for d, (lost, step_v) in enumerate(zip(p['axis_lost_bits'], p['step_v'])):
-        ratio = signals.lsb_ratio[d] * 2.0 ** (p['lost_bits'] + lost)
-        signals.lsb_ratio[d] = max(signals.lsb_v * ratio, step_v)
-    signals.lsb_v = 1.0
+        coarser_v = signals.lsb_v[d] * 2.0 ** (p['lost_bits'] + lost)
+        signals.lsb_v[d] = max(coarser_v, step_v)
 
 
 @effect(

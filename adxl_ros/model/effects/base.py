@@ -256,9 +256,8 @@ class Signals:
     rc_s: list[float] = field(default_factory=list)
     # ELECTRONICS: density of the white noise divided by the nominal one, by measured axis
     noise_ratio: list[float] = field(default_factory=list)
-    lsb_v: float = 0.0  # ELECTRONICS: step of the ADC, V
-    # ELECTRONICS: step of the ADC by measured axis divided by `lsb_v`
-    lsb_ratio: list[float] = field(default_factory=list)
+    # ELECTRONICS: step of the ADC by measured axis, V; 0 where it does not quantise
+    lsb_v: list[float] = field(default_factory=list)
     # ADC: volts at the input of the ADC by measured axis. Effects only read them.
     input_v: Components = field(default_factory=list)
     # ADC: `input_v` with the contributions of effects. CODE: volts that the ADC outputs.
