@@ -66,8 +66,6 @@ class HeldOutFits:
     drifts: tuple[str, ...] = ()
     # Figures beside errors of form, as far as they were asked for, by the effects that have them
     beside_errors: dict[frozenset[str], HeldOut] = field(default_factory=dict)
-    # Squares by which predictions differ from those of other sets, as far as they were asked for
-    _between: dict[tuple[str, ...], np.ndarray] = field(default_factory=dict)
 
     def beside_form_errors(self, effects: frozenset[str]) -> HeldOut:
         """Return the figures where some effects of the set have errors of form, too."""
@@ -160,13 +158,11 @@ class HeldOutFits:
 
     def squares_between(self, other: HeldOutFits) -> np.ndarray:
         """Squares by which predictions differ, mean over axes, by block, (m/s²)², (blocks,)."""
-        if other.healthy.effects not in self._between:
-            squares = np.zeros(BLOCKS)
-            for place, own_v, other_v in zip(self.model.places, self._left_v, other._left_v):
-                between = (own_v - other_v) * place.comparison.used / place.v_per_mean_mps2
-                squares += linear.sum_by_block(between**2)
-            self._between[other.healthy.effects] = squares
-        return self._between[other.healthy.effects]
+        squares = np.zeros(BLOCKS)
+        for place, own_v, other_v in zip(self.model.places, self._left_v, other._left_v):
+            between = (own_v - other_v) * place.comparison.used / place.v_per_mean_mps2
+            squares += linear.sum_by_block(between**2)
+        return squares
 
     @property
     def tolerated(self) -> np.ndarray:
