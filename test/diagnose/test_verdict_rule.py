@@ -175,6 +175,19 @@ def test_a_drift_is_weighed_with_the_set_that_it_needs():
     assert decided(too_large).status == 'unknown'
 
 
+def test_beside_a_drift_an_effect_is_needed_only_where_it_surely_predicts():
+    """What predictions differ by is a square, which is never below 0."""
+    for surely, named in ((True, ('bias', 'bias_walk')), (False, ('bias_walk',))):
+        nothing = fits(5.0, drift_mps2=2.0, nats=30_000.0)
+        bias = fits(4.9, drift_mps2=2.0, nats=30_000.0)
+        before = nothing['bias_walk'].figures
+        gained = np.full(BLOCKS, 20.0 / BLOCKS)
+        if not surely:
+            gained[:2] += [200.0, -200.0]
+        bias['bias_walk'].figures = before._replace(log_likelihood=before.log_likelihood + gained)
+        assert decided({NOTHING: nothing, BIAS: bias}).effects == named
+
+
 def test_the_probabilities_sum_to_one_and_the_answer_has_the_largest():
     verdict = decided({NOTHING: fits(5.0), BIAS: fits(0.0), LEVER_ARM: fits(0.02)})
     probabilities = [hypothesis.probability for hypothesis in verdict.hypotheses]
