@@ -88,6 +88,8 @@ class Verdict:
     explained: Interval  # Explained power of the best set
     remainder: Interval  # Reproducible remainder beside it
     left: Interval  # Power that it leaves above the noise floor, repeating or not
+    # Part of it that shows only while joints move, m/s²: vibration of the motor or the mount
+    vibration_mps2: float
     # Amplitude above which a gap of any kind would have shown, m/s²
     upper_limit_mps2: float
     # Part of it that is in no gap, m/s²: zero-g, scale factor, filter and latency differ from the
@@ -230,7 +232,8 @@ def _answer(
     powers = _powers(evidence, best, found, remainder_material, of_noise)
     # A reference that lacks motion leaves more than a floor at rest.
     only_repeats = evidence.fades or not best
-    unexplained = powers.repeats if only_repeats else powers.remaining
+    of_sensor = max(powers.repeats, powers.remaining - evidence.vibration(best))
+    unexplained = powers.repeats if only_repeats else of_sensor
     if unexplained > powers.explained + powers.drift + of_noise:
         return _Answer('unknown')
     named = frozenset(() if evidence.wanders else powers.drifts)
@@ -354,6 +357,7 @@ def decide(
         explained=evidence.gain(best, NOTHING).interval,
         remainder=repeats,
         left=evidence.left(best).interval,
+        vibration_mps2=evidence.vibration(best) ** 0.5,
         upper_limit_mps2=(unseen + tolerated) ** 0.5,
         tolerated_mps2=tolerated**0.5,
         lost_without={e: evidence.lost(best, best - {e}).interval for e in sorted(best)},

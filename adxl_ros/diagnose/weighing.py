@@ -80,6 +80,8 @@ class SimulatedAgain(NamedTuple):
     more_at_rest: np.ndarray
     resting: float  # Number of samples at rest
     at_bound: bool  # Whether a size is at the end of what its parameter can have
+    # Squares of vibration that shows only in motion, so that it is not of the sensor, (blocks,)
+    vibration: np.ndarray
 
 
 class Figure(NamedTuple):
@@ -197,6 +199,17 @@ class Evidence:
         """Return the power that a set, as it is printed, leaves more than another."""
         return self.mean(self.again[effects].printed - self.again[other].printed)
 
+    def vibration(self, effects: frozenset[str]) -> float:
+        """Return the power of the vibration of the stage that a set leaves, (m/s²)²."""
+        if effects not in self.again:
+            return 0.0
+        return max(self.value(self._vibration(effects)), 0.0)
+
+    @_once
+    def _vibration(self, effects: frozenset[str]) -> ByDraw:
+        """Return the same by draw."""
+        return self.mean(self.again[effects].vibration)
+
     def follows(self, remainder: Remainder, dimensions: Collection[str]) -> bool:
         """
         Determine whether functions of any of some dimensions make held-out samples more probable.
@@ -242,9 +255,13 @@ class Evidence:
 
     @_once
     def drift_nats(self, effects: frozenset[str], drift: str, healthy: frozenset[str]) -> ByDraw:
-        """Return by how much a set and a drift are likelier than a set in healthy noise."""
+        """
+        Return by how much a set and a drift are likelier than a set in healthy noise.
+
+        What the effects of that set may have as errors of form is no drift.
+        """
         drifting = self.candidates[effects][drift].figures
-        steady = self.candidates[healthy][HEALTHY].figures
+        steady = self.candidates[healthy][HEALTHY].beside_form_errors(healthy)
         return self.total(drifting.log_likelihood - steady.log_likelihood)
 
     def is_beyond_form(self, effects: frozenset[str], others: frozenset[str]) -> bool:
