@@ -153,7 +153,7 @@ def _of_axis(
 def _of_moves(
     comparison: BaselineComparison, moves: _Moves, along_g: np.ndarray, slopes: np.ndarray
 ) -> _Makers:
-    """Return what makes functions of the moves of joints, for an axis along which force changes."""
+    """Return what makes functions of moves of joints, where the force along an axis changes."""
     if np.ptp(along_g) < _SMALLEST_SPREAD:
         return {}
     return {

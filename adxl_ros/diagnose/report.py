@@ -161,7 +161,7 @@ def _explained_text(report: Report, sure: str) -> str:
 
 
 def _vibration_text(verdict: Verdict) -> str:
-    """Say that most of the remainder is of the stage, in a sentence after another one, if it is."""
+    """Say that most of the remainder is vibration, in a sentence after another one; else nothing."""
     vibration = verdict.vibration_mps2**2
     if vibration < verdict.remaining / 2:
         return ''
