@@ -38,6 +38,9 @@ be an error of its form."""
 _REST_ERRORS = 2.0
 """The same in standard errors: one set in 40 exceeds it by chance."""
 _NATS = 3.0  # Held-out log likelihood that a further effect must gain: a ratio of 20
+_DRIFT_LIMIT = 5.0
+"""Expected mean square of a random walk about its mean, divided by the one in a recording, that
+one walk in 20 exceeds. Derived from the random walk."""
 _LOWEST = 0.05  # Quantile at the lower end of a 90 % interval
 _HIGHEST = 0.95  # Quantile at its upper end
 _SHOWN_BY_POSE = {
@@ -358,8 +361,14 @@ def most_probable_set(evidence: Evidence) -> frozenset[str]:
 
 
 def drifts_beside(evidence: Evidence, effects: frozenset[str]) -> list[str]:
-    """Return the drifts, the best first, that make samples beside a set more probable."""
-    tried = [d for d in evidence.candidates[effects] if d != HEALTHY]
+    """
+    Return the drifts, the best first, that make samples beside a set more probable.
+
+    None is expected to leave far more than the set leaves.
+    """
+    largest = _DRIFT_LIMIT * evidence.value(evidence.squares(effects))
+    fits = evidence.candidates[effects]
+    tried = [d for d in fits if d != HEALTHY and fits[d].drift_mps2 ** 2 <= largest]
     nats = {d: evidence.drift_nats(effects, d, effects) for d in tried}
     drifts = sorted(nats, key=lambda d: -evidence.value(nats[d]))
     if not drifts or not evidence.figure(nats[drifts[0]]).predicts:
