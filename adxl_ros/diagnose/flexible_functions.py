@@ -16,10 +16,10 @@ from functools import cached_property, partial
 from math import prod
 
 from adxl_ros.diagnose import comparison as beside
-from adxl_ros.diagnose.comparison import BaselineComparison, direction_of_last_move
+from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects.base import FormDimension as Form
-from adxl_ros.model.filters import loop, low_pass
+from adxl_ros.model.filters import loop, low_pass, stop
 from adxl_ros.model.kinematics import gravity_slopes
 import numpy as np
 
@@ -41,9 +41,9 @@ _LAG_S = (0.05, 0.5)
 """Time constants of fast lags of the force, s. Chosen: slower than the filter of the sensor."""
 _RELAXATION_S = (1, 4, 16)
 """Time constants of relaxation after a move, s. Chosen: a factor of four apart."""
-_JOINT_REACH = (0.001, 0.004, 0.016, 0.064)
+_LOOP_REACH = (0.001, 0.004, 0.016, 0.064)
 """Reach of loops over an angle, divided by its range. Chosen: a factor of four apart; 0.001 is the
-play of a worm gear, 0.1°, in half a turn."""
+play of a worm gear, 0.1°, in half a turn. A spline that rings at a stop turns by less."""
 _CREEP_S = (2.0, 10.0, 50.0)  # Time constants of creep, s. Chosen: a factor of five apart
 _THERMAL_LAG_S = (20.0, 100.0, 500.0)
 """Time constants of lags of the temperature, s. Chosen: a factor of five apart."""
@@ -51,8 +51,6 @@ _THERMAL_REACH = (0.05, 0.25)
 """Reach of loops over the temperature, divided by its range. Chosen: a factor of five apart."""
 _SMALLEST_RATE_RAD_S = 1e-3
 """Largest rate of a joint below which it has no functions, rad/s. Chosen: it rests."""
-_SMALLEST_TURN = 1e-3
-"""Share of the largest change of force below which it keeps its direction. Chosen: it rests."""
 _SMALLEST_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.01}
 """Range of temperature, °C, and supply, V, below which they have no functions. Chosen: noise."""
 _SMALLEST_SPREAD = 1e-6  # Range of a point. Chosen: above rounding errors
@@ -223,12 +221,7 @@ class _Moves:
     @cached_property
     def branches(self) -> list[np.ndarray]:
         """Return the branches of loops over each joint, of several reaches, (k, n) by joint."""
-        out = []
-        for angle_rad, rate in zip(self.angles_rad, self.rates):
-            range_rad = max(float(np.ptp(angle_rad)), _SMALLEST_SPREAD)
-            loops = [loop(angle_rad, reach * range_rad, {}) for reach in _JOINT_REACH]
-            out.append(np.array([direction_of_last_move(rate), *loops]))
-        return out
+        return [_branches(angle_rad, _LOOP_REACH) for angle_rad in self.angles_rad]
 
 
 def _by_rate(moves: _Moves, along_g: np.ndarray) -> np.ndarray:
@@ -245,15 +238,20 @@ def _by_direction(moves: _Moves, along_g: np.ndarray, slopes: np.ndarray) -> np.
 
     slopes: of the force over each joint, (2, n): play of its gears is an error of its angle.
     """
-    change_g = np.diff(along_g, prepend=along_g[0])
-    directions = [direction_of_last_move(rate) for rate in moves.rates]
-    directions.append(direction_of_last_move(change_g, np.abs(change_g).max() * _SMALLEST_TURN))
+    directions = [*(of_joint[0] for of_joint in moves.branches)]
+    directions += [*_branches(along_g, _LOOP_REACH[:1])]
     functions = []
     for direction in directions:
         functions += [direction, direction * along_g]
-    for branches, slope in zip(moves.branches, slopes):
-        functions += [*(branches * slope)]
+    for of_joint, slope in zip(moves.branches, slopes):
+        functions += [*(of_joint * slope)]
     return np.array(functions)
+
+
+def _branches(values: np.ndarray, reaches: Iterable[float]) -> np.ndarray:
+    """Return the branches of loops whose reach is a share of the range of values, (k, n)."""
+    reach = max(float(np.ptp(values)), _SMALLEST_SPREAD)
+    return np.array([stop(values, share * reach, {}) for share in reaches])
 
 
 def _since_move(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> np.ndarray:

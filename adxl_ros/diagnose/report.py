@@ -161,7 +161,7 @@ def _explained_text(report: Report, sure: str) -> str:
 
 
 def _vibration_text(verdict: Verdict) -> str:
-    """Say that most of the remainder is vibration, in a sentence after another one; else nothing."""
+    """Say that most of the remainder is vibration, after another sentence; empty if it is none."""
     vibration = verdict.vibration_mps2**2
     if vibration < verdict.remaining / 2:
         return ''
