@@ -444,8 +444,9 @@ class Search:
         """Fit a set without each of its effects, and these without each, and so on."""
         for effect in effects:
             fewer = tuple(e for e in effects if e != effect)
-            if frozenset(fewer) not in self.found:
-                start = self.found.get(frozenset(effects), self.best)
+            start = self.found.get(frozenset(effects), self.best)
+            # The first fit of a part of the best set may have ended at a lower maximum.
+            if start is self.best or frozenset(fewer) not in self.found:
                 self._add(fewer, dict(zip(start.names, start.values)), {}, -np.inf)
             if frozenset(fewer) in self.found:
                 self._complete(fewer)
@@ -522,7 +523,9 @@ class Search:
             )
         except (UserError, np.linalg.LinAlgError):
             return
-        if any(map(fitted.is_zero_g, fitted.effects)):
+        before = self.found.get(frozenset(effects))
+        is_worse = before is not None and fitted.log_evidence < before.log_evidence
+        if is_worse or any(map(fitted.is_zero_g, fitted.effects)):
             return
         # Recordings that are not much longer than a time constant do not show it.
         longest_s = max(c.span_s for c in self.model.comparisons)
