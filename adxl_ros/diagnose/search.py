@@ -311,7 +311,7 @@ def fit_hypothesis(
         return _HypothesisIterate(
             values=linearised.values,
             step=linearised.departures(fit)[:j] - present,
-            cost=fit.loss(present) - fit.log_evidence,
+            cost=fit.loss(np.arange(j), present) - fit.log_evidence,
             linearised=linearised,
             fit=fit,
         )
@@ -360,7 +360,7 @@ def _fitted_hypothesis(linear_model: LinearModel, linearised: LinearisedHypothes
         values=at_values,
         std=np.sqrt(std**2 + form**2 + angle_rad**2),
         undetermined=std > evidence.UNDETERMINED_SHARE * widest,
-        log_evidence=fit.log_evidence - fit.loss(at_values),
+        log_evidence=fit.log_evidence - fit.loss(np.arange(j), at_values),
         fit=fit,
         linearised=linearised,
     )
@@ -372,6 +372,7 @@ class _Ranked(NamedTuple):
     gain: float
     chosen: tuple[int, ...]
     fit: LinearFit
+    start: float  # The gain where limits begin as they were simulated
 
 
 class Search:
@@ -468,7 +469,7 @@ class Search:
         """
         Fit sets of variants beside present ones on a linear model, by falling gain.
 
-        Of each set of effects the best variants are ranked.
+        Of each set of effects the variants that begin best are ranked.
         """
         without = model.fit_variants(present) if present else model.null_fit
         best: dict[frozenset[str], _Ranked] = {}
@@ -477,8 +478,9 @@ class Search:
             if len(effects) == len(chosen):
                 fit = model.fit_variants([*present, *chosen], without)
                 gain = fit.log_evidence - without.log_evidence
-                if effects not in best or gain > best[effects].gain:
-                    best[effects] = _Ranked(gain, chosen, fit)
+                ranked = _Ranked(gain, chosen, fit, gain - _loss_of_limits(model, chosen, fit))
+                if effects not in best or ranked.start > best[effects].start:
+                    best[effects] = ranked
         return sorted(best.values(), key=lambda f: -f.gain)
 
     def _fit(self, model: LinearModel, ranked: _Ranked, beside: Hypothesis | None = None) -> None:
@@ -537,6 +539,13 @@ class Search:
             for e in fitted.effects
         ):
             self.found[frozenset(effects)] = fitted
+
+
+def _loss_of_limits(model: LinearModel, chosen: Sequence[int], fit: LinearFit) -> float:
+    """Return what a fit loses where limits clip as much as they were simulated to."""
+    limited = [model.column_ids[i] for i in chosen if model.variants[i].limit_start]
+    places = np.flatnonzero(np.isin(fit.column_ids, [*chain(*limited)]))
+    return fit.loss(places, np.ones(len(places)))
 
 
 def _identifiable(model: LinearModel) -> list[int]:
