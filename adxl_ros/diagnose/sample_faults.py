@@ -30,7 +30,12 @@ _SPIKE_NEIGHBOUR = 2
 _OTHER_NEIGHBOUR = 3
 """The same where another spike is the neighbour: two of the same sign hide each other."""
 _SPIKE_LOCAL_S = 0.2  # Width of the blocks of the local scale, s. Chosen: shorter than a move
-_SPIKE_LOCAL_FEWEST = 9  # The same in samples. Chosen: a median of nine ignores a spike
+_SPIKE_LOCAL_FEWEST = 21  # The same in samples. Chosen: two spikes and their neighbours are 6
+_SPIKE_LOCAL_SHARE = 0.7
+"""Quantile of the deviations that is the local scale. Chosen: a burst of vibration in a third of a
+block is no spike."""
+_SPIKE_LOCAL_TO_STD = 1 / scipy.stats.norm.ppf((1 + _SPIKE_LOCAL_SHARE) / 2)
+"""Standard deviation of normal deviations, divided by that quantile of their magnitudes."""
 COARSE_STEPS = 1.6
 """Distance of codes, in stated steps, from which they are coarse. Chosen: below that of one lost
 bit."""
@@ -227,8 +232,8 @@ def _usual_deviation_v(
     blocks = max(len(volts) // width, 1)
     parts_v = deviation_v[: blocks * width].reshape(blocks, -1)
     middles = (np.arange(blocks) + 0.5) * width
-    local_v = np.interp(np.arange(len(volts)), middles, MAD_TO_STD * np.median(parts_v, axis=1))
-    return np.maximum(local_v, std_v)
+    levels_v = _SPIKE_LOCAL_TO_STD * np.quantile(parts_v, _SPIKE_LOCAL_SHARE, axis=1)
+    return np.maximum(np.interp(np.arange(len(volts)), middles, levels_v), std_v)
 
 
 def _stands_alone(volts: np.ndarray, smallest_v: np.ndarray, distance: int) -> np.ndarray:
