@@ -40,6 +40,7 @@ _LOWEST_INTERNAL_RATE_HZ = 250.0
 search."""
 _MOST_STEPS = 1_000_000
 """Largest number of steps of the simulator beyond the samples. Chosen: an hour at that rate."""
+_MORE_OUTPUTS = 13  # Kept by the search. Chosen: many sets start at the same values; 1 MB each
 _SMALLEST_MOVES = {'alpha': 2e-3, 'beta': 2e-3, 'shift': 1e-6}
 """Ranges of the joints, rad and m, from which they move. Chosen: above the step of an encoder."""
 _REST_RATE = 1e-3
@@ -277,7 +278,7 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     return replace(
         comparison,
         motion=motion,
-        memo=ChainMemo(),
+        memo=ChainMemo(more_volts=_MORE_OUTPUTS),
         sensor=comparison.sensor.computed_at(rate_hz / every),
         **{
             name: getattr(comparison, name)[::every]

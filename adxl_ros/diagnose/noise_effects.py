@@ -109,9 +109,19 @@ def _excess(
 def periodogram(
     values: np.ndarray, rate_hz: float, window: str = 'boxcar'
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies, Hz, (k,), and spectra of m axes, (n, m); one by one, to save memory."""
-    spectra = [scipy.signal.periodogram(v, rate_hz, window) for v in values.T]
-    return spectra[0][0], np.array([power for _, power in spectra]).T
+    """
+    Return frequencies, Hz, (k,), and spectra of m axes, (n, m); one by one, to save memory.
+
+    They are those of `scipy.signal.periodogram`, which takes eight times as long.
+    """
+    count = len(values)
+    weights = scipy.signal.get_window(window, count)
+    spectra = [np.abs(np.fft.rfft(weights * (v - v.mean()))) ** 2 for v in values.T]
+    power = 2 / (rate_hz * np.sum(weights**2)) * np.array(spectra).T
+    # The mean has one side alone, and so has half of an even rate.
+    power[0] /= 2
+    power[-1] /= 2 - count % 2
+    return np.fft.rfftfreq(count, 1 / rate_hz), power
 
 
 def white_noise_v(

@@ -315,7 +315,7 @@ def _angle_error_filter(
         rows.append((phi - gain * weight, gain, weight, sqrt(noise_v2 / total_v2)))
         variance = phi * phi * variance + renewal2 - gain * gain * total_v2
         previous_v = g
-    transition, gains, weights, scale = np.array(rows).T
+    transition, gains, weights, scale = map(np.array, zip(*rows))
     return AngleErrorFilter(
         float(np.sqrt(np.mean(variance_v2))), pole, transition, gains, weights, scale
     )

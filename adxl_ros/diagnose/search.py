@@ -173,7 +173,7 @@ def linearise(
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.
     parts = linear_model.taken_up(changes, 1)
-    taken_up = np.array([float(parts[n][0]) if n in parts else 0.0 for n in nuisances])
+    taken_up = np.array([parts.get(n, [0.0])[0] for n in nuisances])
     tolerance = np.array([linear_model.tolerances[name] for name in nuisances])
     linearised = LinearisedHypothesis(
         effects=tuple(effects),
@@ -486,12 +486,12 @@ class Search:
     def _fit(self, model: LinearModel, ranked: _Ranked, beside: Hypothesis | None = None) -> None:
         """Fit a ranked set beside another one."""
         present = beside.effects if beside else ()
-        effects = (*present, *(model.variants[i].effect for i in ranked.chosen))
+        chosen = [model.variants[i] for i in ranked.chosen]
+        effects = (*present, *(variant.effect for variant in chosen))
         if ranked.gain < _WORTH_FITTING or frozenset(effects) in self.found:
             return
         start = dict(zip(beside.names, beside.values)) if beside else {}
         shapes: dict[Coefficient, float] = {}
-        chosen = [model.variants[i] for i in ranked.chosen]
         own = set(chain(*(model.column_ids[i] for i in ranked.chosen)))
         for k, value in zip(ranked.fit.column_ids, ranked.fit.values):
             if k in own:
@@ -592,9 +592,9 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
         replace(c, sensor=replace(c.at_rate(best.sensor), values=values))
         for c in model.comparisons
     ]
-    outputs_v = zip(comparisons, model.baseline_v)
     is_near = all(
-        rms(c.simulated_v(c.sensor) - v) < _SMALL_CHANGE * rms(v.std(axis=0)) for c, v in outputs_v
+        rms(c.simulated_v(c.sensor) - v) < _SMALL_CHANGE * rms(v.std(axis=0))
+        for c, v in zip(comparisons, model.baseline_v)
     )
     return linear.build_linear_model(
         comparisons,

@@ -402,9 +402,14 @@ def _neighbours(steps: np.ndarray) -> _Neighbours:
 class ChainMemo:
     """Results of parts of the chain by what they depend on, the newest of each part."""
 
-    def __init__(self, most: int = 3) -> None:
-        """Keep so many of each part. Chosen: baseline, hypothesis, one more; 100 MB for 10 min."""
+    def __init__(self, most: int = 3, more_volts: int = 0) -> None:
+        """
+        Keep so many of each part, and some more outputs in volts.
+
+        Chosen: baseline, hypothesis, one more; 100 MB for 10 min.
+        """
         self._most = most
+        self._more_volts = more_volts
         self._kept: dict[str, dict[Hashable, Any]] = {}
 
     def __call__(self, part: str, key: Hashable, compute: Callable[[], Any]) -> Any:
@@ -412,7 +417,7 @@ class ChainMemo:
         kept = self._kept.setdefault(part, {})
         # The entry moves to the end, so that the one that was not used for longest is dropped.
         result = kept[key] = kept.pop(key) if key in kept else compute()
-        if len(kept) > self._most:
+        if len(kept) > self._most + (part == 'volts') * self._more_volts:
             del kept[next(iter(kept))]
         return result
 

@@ -13,7 +13,7 @@ from adxl_ros.model.sensor import with_neutral, with_values
 from adxl_ros.model.signal_chain import quantise
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import lfilter, periodogram
 from units import nominal
 
 RATE_HZ = 100.0
@@ -28,6 +28,16 @@ def sensor(axes='xy', **changes):
 def white_v(std_v=1e-3, seed=1):
     """Return an output at rest, which has no rounding."""
     return 2.5 + std_v * np.random.default_rng(seed).normal(size=(COUNT, 2))
+
+
+@pytest.mark.parametrize('count', [COUNT, COUNT - 1])
+@pytest.mark.parametrize('window', ['boxcar', 'hann'])
+def test_spectra_are_those_of_scipy(count, window):
+    values = white_v()[:count] - 2.5
+    found = noise_effects.periodogram(values, RATE_HZ, window)
+    expected = periodogram(values, RATE_HZ, window, axis=0)
+    for own, other in zip(found, expected):
+        assert own == pytest.approx(other, rel=1e-9, abs=1e-9 * other.mean())
 
 
 def test_the_allan_deviation_of_white_noise_falls_with_the_root():
