@@ -20,10 +20,11 @@ from adxl_ros.files.stamps import mean_period_s, stamped_rate_hz
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.error_sizes import rms
+from adxl_ros.model.filters import stop
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import noiseless, Sensor
 from adxl_ros.report.quantities import acceleration_text
-from adxl_ros.signals.block_statistics import held_values, true_runs
+from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.motion import ForcePath, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.recorded_motion import environment_paths, motion_from_references
 from adxl_ros.simulate.response import ChainMemo, whole_response
@@ -44,6 +45,9 @@ _SMALLEST_MOVES = {'alpha': 2e-3, 'beta': 2e-3, 'shift': 1e-6}
 _REST_RATE = 1e-3
 """A joint rests below this rate, rad/s, and the shift below this acceleration, m/s². Chosen: the
 specific force then changes by less than the noise within a second."""
+_SMALLEST_TURN_RAD = 1e-3
+"""Turn of a joint that is a move, rad. Chosen: the force changes by 1 mg, and a spline that rings
+at a stop turns by less."""
 SETTLING_S = 0.3
 """A sample rests if no joint moves within this time before it, s. Chosen: an RC filter of 15 Hz
 has settled."""
@@ -343,9 +347,9 @@ def _at_rest(
     return time_since_move_s(time_s, rates) > SETTLING_S
 
 
-def direction_of_last_move(rate: np.ndarray, smallest: float = _REST_RATE) -> np.ndarray:
-    """Return the direction of the last move, −1 or 1, 0 before the first, (n,)."""
-    return held_values(np.sign(rate), np.abs(rate) > smallest, 0.0)
+def direction_of_last_move(angle_rad: np.ndarray) -> np.ndarray:
+    """Return the direction of the last move of a joint, −1 or 1, 0 before the first, (n,)."""
+    return np.rint(stop(angle_rad, _SMALLEST_TURN_RAD, {}))
 
 
 def time_since_move_s(time_s: np.ndarray, rates: Sequence[np.ndarray]) -> np.ndarray:

@@ -296,10 +296,31 @@ def _held_out(search: Search) -> dict[frozenset[str], Mapping[str, HeldOutFits]]
     return out
 
 
-def _squares_left(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:
-    """Return the squares that a sensor leaves, mean over axes, (m/s²)², (n,); 0 if not used."""
+def _left(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:
+    """Return what a sensor leaves, m/s², (n, m); 0 where a sample is not used."""
     residual_mps2 = comparison.residual_v(sensor) / comparison.scale_v_per_mps2
-    return np.where(comparison.used, np.mean(residual_mps2**2, axis=1), 0.0)
+    return np.where(comparison.used[:, None], residual_mps2, 0.0)
+
+
+def _mean_squares(values: np.ndarray) -> np.ndarray:
+    """Return the mean squares over axes of values, (n, m)."""
+    return np.mean(values**2, axis=1)
+
+
+def _vibration_in_motion(comparison: BaselineComparison, left_mps2: np.ndarray) -> np.ndarray:
+    """
+    Return the squares of vibration that shows only while joints move, (m/s²)², by block.
+
+    It changes from sample to sample, as no motion of an encoder does, and is no noise of the
+    sensor, which shows at rest, too.
+    """
+    paired = comparison.used & np.roll(comparison.used, 1)
+    rests = comparison.at_rest & paired
+    if not comparison.joints or not rests.any():
+        return np.zeros(BLOCKS)
+    squares = _mean_squares(left_mps2 - np.roll(left_mps2, 1, axis=0)) / 2
+    moves = paired & ~comparison.at_rest
+    return sum_by_block(np.where(moves, squares - squares[rests].mean(), 0.0))
 
 
 def _simulate_again(search: Search, effects: frozenset[str]) -> SimulatedAgain:
@@ -307,17 +328,22 @@ def _simulate_again(search: Search, effects: frozenset[str]) -> SimulatedAgain:
     hypothesis = search.found[effects]
     plain = search.found[frozenset()]
     printed = as_printed(hypothesis, with_neutral(search.model.baseline, hypothesis.effects))
-    squares = np.zeros(BLOCKS)
+    squares, vibration = np.zeros((2, BLOCKS))
     more_at_rest = []
     resting = 0
     for c in search.model.comparisons:
-        squares += sum_by_block(_squares_left(c, printed))
+        left_mps2 = _left(c, printed)
+        squares += sum_by_block(_mean_squares(left_mps2))
+        vibration += _vibration_in_motion(c, left_mps2)
         if c.pose_known:
-            more = _squares_left(c, hypothesis.sensor) - _squares_left(c, plain.sensor)
+            fitted_mps2, plain_mps2 = _left(c, hypothesis.sensor), _left(c, plain.sensor)
+            more = _mean_squares(fitted_mps2) - _mean_squares(plain_mps2)
             for begin, end in true_runs(c.at_rest & c.used):
                 more_at_rest.append(float(np.sum(more[begin:end])))
                 resting += end - begin
-    return SimulatedAgain(squares, np.array(more_at_rest), float(resting), hypothesis.at_bound)
+    return SimulatedAgain(
+        squares, np.array(more_at_rest), float(resting), hypothesis.at_bound, vibration
+    )
 
 
 def _detections(

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from math import prod
 
 from adxl_ros.diagnose import comparison as beside
-from adxl_ros.diagnose.comparison import BaselineComparison, direction_of_last_move
+from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects.base import FormDimension as Form
-from adxl_ros.model.filters import loop, low_pass
+from adxl_ros.model.filters import loop, low_pass, stop
 from adxl_ros.model.kinematics import gravity_slopes
 import numpy as np
 
@@ -41,6 +41,9 @@ _LAG_S = (0.05, 0.5)
 """Time constants of fast lags of the force, s. Chosen: slower than the filter of the sensor."""
 _RELAXATION_S = (1, 4, 16)
 """Time constants of relaxation after a move, s. Chosen: a factor of four apart."""
+_LOOP_REACH = (0.001, 0.004, 0.016, 0.064)
+"""Reach of loops over an angle, divided by its range. Chosen: a factor of four apart; 0.001 is the
+play of a worm gear, 0.1°, in half a turn. A spline that rings at a stop turns by less."""
 _CREEP_S = (2.0, 10.0, 50.0)  # Time constants of creep, s. Chosen: a factor of five apart
 _THERMAL_LAG_S = (20.0, 100.0, 500.0)
 """Time constants of lags of the temperature, s. Chosen: a factor of five apart."""
@@ -48,8 +51,6 @@ _THERMAL_REACH = (0.05, 0.25)
 """Reach of loops over the temperature, divided by its range. Chosen: a factor of five apart."""
 _SMALLEST_RATE_RAD_S = 1e-3
 """Largest rate of a joint below which it has no functions, rad/s. Chosen: it rests."""
-_SMALLEST_TURN = 1e-3
-"""Share of the largest change of force below which it keeps its direction. Chosen: it rests."""
 _SMALLEST_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.01}
 """Range of temperature, °C, and supply, V, below which they have no functions. Chosen: noise."""
 _SMALLEST_SPREAD = 1e-6  # Range of a point. Chosen: above rounding errors
@@ -76,6 +77,7 @@ def flexible_bases(
     slopes = np.zeros((2, len(AXES), 0))
     if comparison.joints:
         slopes = gravity_slopes(*comparison.joint_values())
+    moves = _Moves.of(comparison)
     for axis, along_g in enumerate(force_g):
         factors = {
             Form.TEMPERATURE: along_g,
@@ -88,7 +90,10 @@ def flexible_bases(
             if dimension in common:
                 plain = common[dimension]
                 functions[dimension] = np.concatenate([plain, plain * factor])
-        functions |= _made(_of_axis(comparison, force_g, axis, baseline_v[:, axis]), chosen)
+        of_axis = _of_axis(comparison, force_g, axis, baseline_v[:, axis])
+        if moves.moving:
+            of_axis |= _of_moves(comparison, moves, force_g[axis], slopes[:, axis])
+        functions |= _made(of_axis, chosen)
         basis = {d: _normalised(values, comparison.used) for d, values in functions.items()}
         yield {d: values for d, values in basis.items() if values.shape[1]}
 
@@ -134,21 +139,26 @@ def _of_axis(
     along_g = force_g[axis]
     if np.ptp(along_g) < _SMALLEST_SPREAD:
         return {}
-    makers: _Makers = {
+    return {
         Form.FORCE: partial(_modes, along_g, Form.FORCE),
         Form.CROSS_FORCE: partial(_cross_force, force_g, axis),
         Form.AGEING: lambda: along_g * _modes(comparison.time_s, Form.AGEING),
         Form.CODE: partial(_codes, volts, comparison.sensor.adc_vref_v),
         Form.LAG: partial(_force_history, along_g, comparison.dt_s),
     }
-    moves = _Moves.of(comparison)
-    if moves.moving:
-        makers |= {
-            Form.RATE: partial(_by_rate, moves, along_g),
-            Form.DIRECTION: partial(_by_direction, moves, along_g),
-            Form.SINCE_MOVE: partial(_since_move, moves, along_g, comparison),
-        }
-    return makers
+
+
+def _of_moves(
+    comparison: BaselineComparison, moves: _Moves, along_g: np.ndarray, slopes: np.ndarray
+) -> _Makers:
+    """Return what makes functions of moves of joints, where the force along an axis changes."""
+    if np.ptp(along_g) < _SMALLEST_SPREAD:
+        return {}
+    return {
+        Form.RATE: partial(_by_rate, moves, along_g),
+        Form.DIRECTION: partial(_by_direction, moves, along_g, slopes),
+        Form.SINCE_MOVE: partial(_since_move, moves, along_g, comparison),
+    }
 
 
 def _cross_force(force_g: np.ndarray, axis: int) -> np.ndarray:
@@ -196,6 +206,7 @@ def _force_history(along_g: np.ndarray, dt_s: float) -> np.ndarray:
 class _Moves:
     """The moves of the joints of a recording."""
 
+    angles_rad: Sequence[np.ndarray]  # Angles of all joints, (n,)
     rates: list[np.ndarray]  # Rates of all joints, rad/s, (n,)
     moving: list[np.ndarray]  # Rates of the joints that move, divided by the largest, (n,)
 
@@ -204,7 +215,13 @@ class _Moves:
         """Return the moves of a recording; no joint moves where it has none."""
         rates = comparison.joint_values(1)
         moving = [rate for rate in rates if np.abs(rate).max() > _SMALLEST_RATE_RAD_S]
-        return cls(rates, [rate / np.abs(rate).max() for rate in moving])
+        relative = [rate / np.abs(rate).max() for rate in moving]
+        return cls(comparison.joint_values(), rates, relative)
+
+    @cached_property
+    def branches(self) -> list[np.ndarray]:
+        """Return the branches of loops over each joint, of several reaches, (k, n) by joint."""
+        return [_branches(angle_rad, _LOOP_REACH) for angle_rad in self.angles_rad]
 
 
 def _by_rate(moves: _Moves, along_g: np.ndarray) -> np.ndarray:
@@ -215,15 +232,26 @@ def _by_rate(moves: _Moves, along_g: np.ndarray) -> np.ndarray:
     return np.array(functions)
 
 
-def _by_direction(moves: _Moves, along_g: np.ndarray) -> np.ndarray:
-    """Return functions of the directions of the last changes of joints and force, (k, n)."""
-    change_g = np.diff(along_g, prepend=along_g[0])
-    directions = [direction_of_last_move(rate) for rate in moves.rates]
-    directions.append(direction_of_last_move(change_g, np.abs(change_g).max() * _SMALLEST_TURN))
+def _by_direction(moves: _Moves, along_g: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """
+    Return functions of the directions of the last changes of joints and force, (k, n).
+
+    slopes: of the force over each joint, (2, n): play of its gears is an error of its angle.
+    """
+    directions = [*(of_joint[0] for of_joint in moves.branches)]
+    directions += [*_branches(along_g, _LOOP_REACH[:1])]
     functions = []
     for direction in directions:
         functions += [direction, direction * along_g]
+    for of_joint, slope in zip(moves.branches, slopes):
+        functions += [*(of_joint * slope)]
     return np.array(functions)
+
+
+def _branches(values: np.ndarray, reaches: Iterable[float]) -> np.ndarray:
+    """Return the branches of loops whose reach is a share of the range of values, (k, n)."""
+    reach = max(float(np.ptp(values)), _SMALLEST_SPREAD)
+    return np.array([stop(values, share * reach, {}) for share in reaches])
 
 
 def _since_move(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.detection import Detection, detection_of
+from adxl_ros.diagnose.weighing import SHARE_OF_FORM
 from adxl_ros.model import noise
 from adxl_ros.model.constants import MAD_TO_STD, Z_90
 from adxl_ros.model.effects.base import Detector
@@ -88,16 +89,20 @@ def _excess(
     # The level of noise far below a step of the ADC does not show.
     shows = (noise.held_rounding(sensor) <= 0.5) & (drawn > 0)
     ratio = recorded / np.where(shows, drawn, np.inf)
+    drawn_v = np.std(simulated_v[rows], axis=0)
     if resting:
         # Noise past the RC filter looks excessive in the innovations, but not in the samples.
         recorded_v = np.std(residual_v[rows], axis=0)
-        drawn_v = np.std(simulated_v[rows], axis=0)
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
     # Both levels scatter.
     scatter = np.sqrt(2 / np.count_nonzero(rows)) * _MEDIAN_SCATTER
     if np.max(ratio) * (1 - Z_90 * scatter) <= NOISE_EXCESS:
         return None
-    power_v2 = np.maximum(ratio**2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2
+    stated_v2 = noise.analog_std_v(sensor) ** 2
+    power_v2 = np.maximum(ratio**2 - 1, 0.0) * stated_v2
+    # A drift has a spectrum of its own, near that of its model.
+    if power_v2.sum() < SHARE_OF_FORM * (drawn_v**2 - stated_v2).sum():
+        return None
     return detection_of(Detector.NOISE_LEVEL, power_v2, sensor, ratio=ratio - 1)
 
 

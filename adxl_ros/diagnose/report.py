@@ -153,11 +153,22 @@ def _explained_text(report: Report, sure: str) -> str:
         return (
             f'Partly explained {sure}: {percent(share)} of the gap is {named}; '
             f'{percent(1 - share)} ({amplitude_text(verdict.remaining)}) is something else.'
-            f'{_follows_text(verdict)}{of_reference}'
+            f'{_vibration_text(verdict)}{_follows_text(verdict)}{of_reference}'
         )
     separate = ': the data do not separate them' if verdict.groups else ''
     noise = f' {noise_text(report)}' if is_only_noise(report) else ''
     return f'Explained {sure} by {named}{separate}.{noise}{of_reference}'
+
+
+def _vibration_text(verdict: Verdict) -> str:
+    """Say that most of the remainder is vibration, after another sentence; empty if it is none."""
+    vibration = verdict.vibration_mps2**2
+    if vibration < verdict.remaining / 2:
+        return ''
+    return (
+        f' {amplitude_text(vibration)} of it is vibration that shows only while joints move: of '
+        'the motor or the mount.'
+    )
 
 
 def _follows_text(verdict: Verdict) -> str:

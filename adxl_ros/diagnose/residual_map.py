@@ -88,8 +88,8 @@ def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
             'alpha_rad': alpha_rad,
             'beta_rad': beta_rad % (2 * np.pi),
             'rate_rad_s': np.hypot(*rates),
-            'direction_alpha': direction_of_last_move(rates[0]),
-            'direction_beta': direction_of_last_move(rates[1]),
+            'direction_alpha': direction_of_last_move(alpha_rad),
+            'direction_beta': direction_of_last_move(beta_rad),
             'since_move_s': np.minimum(
                 beside.time_since_move_s(time_s, rates), _LONGEST_SINCE_MOVE_S
             ),

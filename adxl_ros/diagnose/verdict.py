@@ -40,9 +40,6 @@ MATERIAL_SHARE_OF_NOISE = 0.1
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
 error in 1000."""
-_DRIFT_LIMIT = 5.0
-"""Expected mean square of a random walk about its mean, divided by the one in a recording, that
-one walk in 20 exceeds. Derived from the random walk."""
 _REPEATED = (0.0, 0.5, 0.8, 0.95, 1.0)
 """Shares of the draws that repeat a verdict, at which `_RIGHT` is known."""
 _RIGHT = (0.2, 0.4, 0.6, 0.75, 0.9)
@@ -88,6 +85,8 @@ class Verdict:
     explained: Interval  # Explained power of the best set
     remainder: Interval  # Reproducible remainder beside it
     left: Interval  # Power that it leaves above the noise floor, repeating or not
+    # Part of it that shows only while joints move, m/s²: vibration of the motor or the mount
+    vibration_mps2: float
     # Amplitude above which a gap of any kind would have shown, m/s²
     upper_limit_mps2: float
     # Part of it that is in no gap, m/s²: zero-g, scale factor, filter and latency differ from the
@@ -175,12 +174,11 @@ def _powers(
     material = repeats.value if found.repeats and repeats.low > remainder_material else 0.0
     if not found.drifts:
         return _Powers(explained, above, material, 0.0, ())
-    powers = {d: evidence.candidates[best][d].drift_mps2 ** 2 for d in found.drifts}
-    possible = [d for d in found.drifts if powers[d] <= _DRIFT_LIMIT * left]
-    if not possible or not found.is_random:
+    if not found.is_random:
         # The fit of a drift takes up what is none, too.
         return _Powers(explained, above, max(repeats.value, above), 0.0, ())
-    return _Powers(explained, above, material, powers[possible[0]], possible)
+    drift = evidence.candidates[best][found.drifts[0]].drift_mps2 ** 2
+    return _Powers(explained, above, material, drift, found.drifts)
 
 
 def _rivals(
@@ -230,7 +228,8 @@ def _answer(
     powers = _powers(evidence, best, found, remainder_material, of_noise)
     # A reference that lacks motion leaves more than a floor at rest.
     only_repeats = evidence.fades or not best
-    unexplained = powers.repeats if only_repeats else powers.remaining
+    of_sensor = max(powers.repeats, powers.remaining - evidence.vibration(best))
+    unexplained = powers.repeats if only_repeats else of_sensor
     if unexplained > powers.explained + powers.drift + of_noise:
         return _Answer('unknown')
     named = frozenset(() if evidence.wanders else powers.drifts)
@@ -354,6 +353,7 @@ def decide(
         explained=evidence.gain(best, NOTHING).interval,
         remainder=repeats,
         left=evidence.left(best).interval,
+        vibration_mps2=evidence.vibration(best) ** 0.5,
         upper_limit_mps2=(unseen + tolerated) ** 0.5,
         tolerated_mps2=tolerated**0.5,
         lost_without={e: evidence.lost(best, best - {e}).interval for e in sorted(best)},

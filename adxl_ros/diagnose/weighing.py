@@ -41,6 +41,9 @@ _LASTING_SHARE = 0.5
 """Share of its log likelihood that a set must gain in quarters that are held out as a whole.
 Chosen: a set names most of a gap."""
 _NATS = 3.0  # Held-out log likelihood that a further effect must gain: a ratio of 20
+_DRIFT_LIMIT = 5.0
+"""Expected mean square of a random walk about its mean, divided by the one in a recording, that
+one walk in 20 exceeds. Derived from the random walk."""
 _LOWEST = 0.05  # Quantile at the lower end of a 90 % interval
 _HIGHEST = 0.95  # Quantile at its upper end
 _SHOWN_BY_POSE = {
@@ -83,6 +86,8 @@ class SimulatedAgain(NamedTuple):
     more_at_rest: np.ndarray
     resting: float  # Number of samples at rest
     at_bound: bool  # Whether a size is at the end of what its parameter can have
+    # Squares of vibration that shows only in motion, so that it is not of the sensor, (blocks,)
+    vibration: np.ndarray
 
 
 class Figure(NamedTuple):
@@ -206,6 +211,17 @@ class Evidence:
         """Return the power that a set, as it is printed, leaves more than another."""
         return self.mean(self.again[effects].printed - self.again[other].printed)
 
+    def vibration(self, effects: frozenset[str]) -> float:
+        """Return the power of the vibration of the stage that a set leaves, (m/s²)²."""
+        if effects not in self.again:
+            return 0.0
+        return max(self.value(self._vibration(effects)), 0.0)
+
+    @_once
+    def _vibration(self, effects: frozenset[str]) -> ByDraw:
+        """Return the same by draw."""
+        return self.mean(self.again[effects].vibration)
+
     def follows(self, remainder: Remainder, dimensions: Collection[str]) -> bool:
         """
         Determine whether functions of any of some dimensions make held-out samples more probable.
@@ -256,9 +272,13 @@ class Evidence:
 
     @_once
     def drift_nats(self, effects: frozenset[str], drift: str, healthy: frozenset[str]) -> ByDraw:
-        """Return by how much a set and a drift are likelier than a set in healthy noise."""
+        """
+        Return by how much a set and a drift are likelier than a set in healthy noise.
+
+        What the effects of that set may have as errors of form is no drift.
+        """
         drifting = self.candidates[effects][drift].figures
-        steady = self.candidates[healthy][HEALTHY].figures
+        steady = self.candidates[healthy][HEALTHY].beside_form_errors(healthy)
         return self.total(drifting.log_likelihood - steady.log_likelihood)
 
     def is_beyond_form(self, effects: frozenset[str], others: frozenset[str]) -> bool:
@@ -344,8 +364,14 @@ def most_probable_set(evidence: Evidence) -> frozenset[str]:
 
 
 def drifts_beside(evidence: Evidence, effects: frozenset[str]) -> list[str]:
-    """Return the drifts, the best first, that make samples beside a set more probable."""
-    tried = [d for d in evidence.candidates[effects] if d != HEALTHY]
+    """
+    Return the drifts, the best first, that make samples beside a set more probable.
+
+    None is expected to leave far more than the set leaves.
+    """
+    largest = _DRIFT_LIMIT * evidence.value(evidence.squares(effects))
+    fits = evidence.candidates[effects]
+    tried = [d for d in fits if d != HEALTHY and fits[d].drift_mps2 ** 2 <= largest]
     nats = {d: evidence.drift_nats(effects, d, effects) for d in tried}
     drifts = sorted(nats, key=lambda d: -evidence.value(nats[d]))
     if not drifts or not evidence.figure(nats[drifts[0]]).predicts:

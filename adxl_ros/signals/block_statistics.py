@@ -188,10 +188,10 @@ def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.array([np.interp(number, kept, column[kept]) for column in data.T]).T
 
 
-def held_values(values: np.ndarray, known: np.ndarray, before: float = np.nan) -> np.ndarray:
-    """Hold each known value until the next one, (n,); `before` is the value before the first."""
+def held_values(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Hold each known value until the next one, (n,); NaN before the first."""
     last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
-    return np.where(last >= 0, values[last], before)
+    return np.where(last >= 0, values[last], np.nan)
 
 
 class Spans:

@@ -101,8 +101,10 @@ def test_gaps_are_bridged_by_lines_and_ends_hold():
 
 
 def test_the_direction_of_the_last_move_stays():
-    rates = np.array([0.0, 0.5, 0.0, -0.2, 1e-6, 0.3])
-    assert beside.direction_of_last_move(rates).tolist() == [0, 1, 1, -1, -1, 1]
+    """A path by the steps of an encoder rings at a stop, by less than a move."""
+    angles_rad = np.array([0.0, 1e-5, 0.5, 0.4999, 0.5001, 0.3, 0.3001, 0.6])
+    directions = beside.direction_of_last_move(angles_rad).tolist()
+    assert directions == [0, 0, 1, 1, 1, -1, -1, 1]
 
 
 def test_any_joint_ends_a_rest():

@@ -8,6 +8,8 @@ from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.residual_map import not_covered, residual_map
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects.base import FormDimension
+from adxl_ros.model.kinematics import gravity_slopes
 from gaps import simulated, turning, unit, warm
 import numpy as np
 import pytest
@@ -56,3 +58,19 @@ def test_flexible_functions_have_an_rms_of_one_about_zero(healthy):
             used = functions[healthy.used]
             assert used.mean(axis=0) == pytest.approx(0.0, abs=1e-9)
             assert (used**2).mean(axis=0).sum() == pytest.approx(1.0)
+
+
+def test_play_that_closes_gradually_is_an_error_of_form_of_backlash(healthy):
+    """Dahl's friction: the joint is behind by half the play times a memory of its direction."""
+    angles_rad = healthy.joint_values()
+    play_rad = 0.004
+    memory = [0.0]
+    for step_rad in np.diff(angles_rad[1]):
+        forgotten = 1 - np.exp(-abs(step_rad) / play_rad)
+        memory.append(memory[-1] + (np.sign(step_rad) - memory[-1]) * forgotten)
+    behind = gravity_slopes(*angles_rad)[1] * np.array(memory)
+    bases = flexible_bases(healthy, healthy.simulated_v(healthy.sensor))
+    for change, basis in zip(behind, bases):
+        functions = basis[FormDimension.DIRECTION]
+        left = change - functions @ np.linalg.lstsq(functions, change - change.mean())[0]
+        assert left.std() < 0.2 * change.std()

@@ -9,7 +9,7 @@ from adxl_ros.diagnose.evidence import BLOCKS
 from adxl_ros.diagnose.held_out import HeldOut
 from adxl_ros.diagnose.remainder import Remainder
 from adxl_ros.diagnose.verdict import block_weights, decide, NoiseCause
-from adxl_ros.diagnose.weighing import ByDraw, Evidence, HEALTHY
+from adxl_ros.diagnose.weighing import ByDraw, Evidence, HEALTHY, SimulatedAgain
 import numpy as np
 import pytest
 
@@ -30,17 +30,23 @@ def fits(left, drift_mps2=None, seed=1, nats=480.0, tolerated=0.0):
         figures=figures,
         tolerated=np.full(BLOCKS, tolerated * SAMPLES),
         by_quarter=figures.log_likelihood,
+        beside_form_errors=lambda effects: figures,
     )
     made = {HEALTHY: healthy}
     if drift_mps2 is not None:
-        likely = HeldOut(squares, figures.log_likelihood + nats / BLOCKS)
-        made['bias_walk'] = SimpleNamespace(
-            figures=likely,
-            by_quarter=likely.log_likelihood,
-            drift_mps2=drift_mps2,
-            squares_between=lambda other: np.full(BLOCKS, 5 * SAMPLES),
-        )
+        made['bias_walk'] = drifting(figures, drift_mps2, nats)
     return made
+
+
+def drifting(figures, drift_mps2, nats):
+    """Return held-out figures of a set in the noise of a drift that is so much likelier."""
+    likely = figures.log_likelihood + nats / BLOCKS
+    return SimpleNamespace(
+        figures=HeldOut(figures.squares, likely),
+        by_quarter=likely,
+        drift_mps2=drift_mps2,
+        squares_between=lambda other: np.full(BLOCKS, 5 * SAMPLES),
+    )
 
 
 def remainder(power=0.0, dimension='force'):
@@ -57,6 +63,7 @@ def decided(
     dimension='force',
     only=(),
     floor_error=0.0,
+    vibration=0.0,
 ):
     floor = FLOOR + floor_error * np.random.default_rng(2).normal(size=len(block_weights(0)))
     floor[0] = FLOOR
@@ -75,7 +82,14 @@ def decided(
     if only:
         shares = np.isin(np.arange(BLOCKS), only) * BLOCKS / len(only)
         left = replace(left, squares=left.squares * shares)
-    return decide(evidence, lambda effects, drift: left, in_noise)
+    again = SimulatedAgain(
+        printed=np.zeros(BLOCKS),
+        more_at_rest=np.zeros(1),
+        resting=0.0,
+        at_bound=False,
+        vibration=np.full(BLOCKS, vibration * SAMPLES),
+    )
+    return decide(evidence, lambda effects, drift: left, in_noise, lambda effects: again)
 
 
 def test_nothing_above_the_noise_is_no_gap():
@@ -172,6 +186,15 @@ def test_effects_that_explain_less_than_they_leave_are_no_cause():
     assert beside.effects == ('bias', 'mains_hum')
 
 
+def test_vibration_of_the_stage_makes_no_cause_unknown():
+    """It shows only while joints move, so that it is of the motor or the mount."""
+    candidates = {NOTHING: fits(5.0), BIAS: fits(3.0)}
+    verdict = decided(candidates, vibration=2.5)
+    assert (verdict.status, verdict.effects) == ('partly', ('bias',))
+    assert verdict.vibration_mps2**2 == pytest.approx(2.5)
+    assert decided(candidates, vibration=0.5).status == 'unknown'
+
+
 def test_what_is_left_counts_beyond_the_interval_of_the_floor():
     """A floor from a few samples at rest may be higher than it seems."""
     candidates = {NOTHING: fits(0.5), BIAS: fits(0.3)}
@@ -203,6 +226,20 @@ def test_a_drift_is_weighed_with_the_set_that_it_needs():
     assert decided(candidates, left_over=0.1, dimension='force').status == 'unknown'
     too_large = {**candidates, NOTHING: fits(5.0, drift_mps2=6.0, nats=30_000.0)}
     assert decided(too_large).status == 'unknown'
+    # Another drift is less likely, but not too large.
+    beside = drifting(too_large[NOTHING][HEALTHY].figures, 2.0, 20_000.0)
+    flicker = {**candidates, NOTHING: {**too_large[NOTHING], 'flicker': beside}}
+    assert decided(flicker).effects == ('flicker',)
+
+
+def test_what_errors_of_form_explain_is_no_drift():
+    """Beside them the samples are more probable than in noise that drifts."""
+    candidates = {NOTHING: fits(50.0, 2.0), BIAS: fits(5.0, drift_mps2=2.0, nats=480.0)}
+    assert decided(candidates).effects == ('bias', 'bias_walk')
+    figures = candidates[BIAS][HEALTHY].figures
+    likelier = figures._replace(log_likelihood=figures.log_likelihood + 500.0 / BLOCKS)
+    candidates[BIAS][HEALTHY].beside_form_errors = lambda effects: likelier
+    assert decided(candidates, left_over=0.0).effects == ('bias',)
 
 
 def test_beside_a_drift_an_effect_is_needed_only_where_it_surely_predicts():
