@@ -154,19 +154,17 @@ class LinearFit:
         mean[places] = values
         return mean
 
-    def loss(self, values: np.ndarray) -> float:
+    def loss(self, places: np.ndarray, values: np.ndarray) -> float:
         """
-        Return how far the log posterior at values of the first coefficients is below its top.
+        Return how far the log posterior at values of coefficients at places is below its top.
 
         The other coefficients are at their conditional maximum.
         """
-        count = len(values)
-        std = stds(self.covariance)[:count]
-        deviation = (values - self.values[:count]) / std
-        correlation = self.covariance[:count, :count] / std / std[:, None]
-        return 0.5 * float(
-            deviation @ np.linalg.solve(correlation + _RIDGE * np.eye(count), deviation)
-        )
+        std = stds(self.covariance)[places]
+        deviation = (values - self.values[places]) / std
+        correlation = self.covariance[np.ix_(places, places)] / std / std[:, None]
+        ridge = _RIDGE * np.eye(len(places))
+        return 0.5 * float(deviation @ np.linalg.solve(correlation + ridge, deviation))
 
 
 def fit_columns(

@@ -172,7 +172,7 @@ def _shapes(effect: Effect) -> list[dict[str, float]]:
 def _limit_variants(
     comparison: BaselineComparison, effect: Effect, limit: Parameter, baseline_v: np.ndarray
 ) -> Iterator[Variant]:
-    """Try limits that clip small shares of the samples."""
+    """Try limits that clip small shares of the samples, and the largest recorded output."""
     sensor = comparison.sensor
     axes, with_effect = sensor.axes, with_neutral(sensor, [effect.name])
     names = _names_of_parameter(effect, limit, axes)
@@ -181,9 +181,13 @@ def _limit_variants(
     for p in (p for p in effect.parameters if p.is_size):
         value = p.scale if p.lower == p.neutral else p.neutral
         start |= dict.fromkeys(_names_of_parameter(effect, p, axes), value)
-    magnitude_g = np.abs(baseline_v - sensor.zero_g_v) / sensor.scale_v_per_g
-    for number, share in enumerate(_CLIPPED_SHARES):
-        values = np.clip(np.quantile(magnitude_g, 1 - share, axis=0), limit.lower, limit.upper)
+    simulated_g, recorded_g = (
+        np.abs(volts - sensor.zero_g_v) / sensor.scale_v_per_g
+        for volts in (baseline_v, comparison.volts[comparison.used])
+    )
+    tried_g = [np.quantile(simulated_g, 1 - share, axis=0) for share in _CLIPPED_SHARES]
+    for number, limits_g in enumerate([*tried_g, recorded_g.max(axis=0)]):
+        values = np.clip(limits_g, limit.lower, limit.upper)
         change_v = comparison.simulated_v(put(with_effect, names, values)) - baseline_v
         clipped = [d for d in range(len(axes)) if np.any(np.abs(change_v[:, d]) > _SMALLEST_V)]
         if clipped:

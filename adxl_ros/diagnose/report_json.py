@@ -39,6 +39,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 'of': words.concern(verdict),
                 'data_fault': None,
                 'probability': verdict.probability,
+                'repeated': verdict.repeated,
                 'surest': report.surest,
             },
             'hypotheses': [h._asdict() for h in verdict.hypotheses],

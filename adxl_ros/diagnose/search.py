@@ -311,7 +311,7 @@ def fit_hypothesis(
         return _HypothesisIterate(
             values=linearised.values,
             step=linearised.departures(fit)[:j] - present,
-            cost=fit.loss(present) - fit.log_evidence,
+            cost=fit.loss(np.arange(j), present) - fit.log_evidence,
             linearised=linearised,
             fit=fit,
         )
@@ -360,7 +360,7 @@ def _fitted_hypothesis(linear_model: LinearModel, linearised: LinearisedHypothes
         values=at_values,
         std=np.sqrt(std**2 + form**2 + angle_rad**2),
         undetermined=std > evidence.UNDETERMINED_SHARE * widest,
-        log_evidence=fit.log_evidence - fit.loss(at_values),
+        log_evidence=fit.log_evidence - fit.loss(np.arange(j), at_values),
         fit=fit,
         linearised=linearised,
     )
@@ -372,6 +372,7 @@ class _Ranked(NamedTuple):
     gain: float
     chosen: tuple[int, ...]
     fit: LinearFit
+    start: float  # The gain where limits begin as they were simulated
 
 
 class Search:
@@ -444,8 +445,9 @@ class Search:
         """Fit a set without each of its effects, and these without each, and so on."""
         for effect in effects:
             fewer = tuple(e for e in effects if e != effect)
-            if frozenset(fewer) not in self.found:
-                start = self.found.get(frozenset(effects), self.best)
+            start = self.found.get(frozenset(effects), self.best)
+            # The first fit of a part of the best set may have ended at a lower maximum.
+            if start is self.best or frozenset(fewer) not in self.found:
                 self._add(fewer, dict(zip(start.names, start.values)), {}, -np.inf)
             if frozenset(fewer) in self.found:
                 self._complete(fewer)
@@ -467,7 +469,7 @@ class Search:
         """
         Fit sets of variants beside present ones on a linear model, by falling gain.
 
-        Of each set of effects the best variants are ranked.
+        Of each set of effects the variants that begin best are ranked.
         """
         without = model.fit_variants(present) if present else model.null_fit
         best: dict[frozenset[str], _Ranked] = {}
@@ -476,8 +478,9 @@ class Search:
             if len(effects) == len(chosen):
                 fit = model.fit_variants([*present, *chosen], without)
                 gain = fit.log_evidence - without.log_evidence
-                if effects not in best or gain > best[effects].gain:
-                    best[effects] = _Ranked(gain, chosen, fit)
+                ranked = _Ranked(gain, chosen, fit, gain - _loss_of_limits(model, chosen, fit))
+                if effects not in best or ranked.start > best[effects].start:
+                    best[effects] = ranked
         return sorted(best.values(), key=lambda f: -f.gain)
 
     def _fit(self, model: LinearModel, ranked: _Ranked, beside: Hypothesis | None = None) -> None:
@@ -522,7 +525,9 @@ class Search:
             )
         except (UserError, np.linalg.LinAlgError):
             return
-        if any(map(fitted.is_zero_g, fitted.effects)):
+        before = self.found.get(frozenset(effects))
+        is_worse = before is not None and fitted.log_evidence < before.log_evidence
+        if is_worse or any(map(fitted.is_zero_g, fitted.effects)):
             return
         # Recordings that are not much longer than a time constant do not show it.
         longest_s = max(c.span_s for c in self.model.comparisons)
@@ -534,6 +539,13 @@ class Search:
             for e in fitted.effects
         ):
             self.found[frozenset(effects)] = fitted
+
+
+def _loss_of_limits(model: LinearModel, chosen: Sequence[int], fit: LinearFit) -> float:
+    """Return what a fit loses where limits clip as much as they were simulated to."""
+    limited = [model.column_ids[i] for i in chosen if model.variants[i].limit_start]
+    places = np.flatnonzero(np.isin(fit.column_ids, [*chain(*limited)]))
+    return fit.loss(places, np.ones(len(places)))
 
 
 def _identifiable(model: LinearModel) -> list[int]:

@@ -40,11 +40,16 @@ MATERIAL_SHARE_OF_NOISE = 0.1
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
 error in 1000."""
-_REPEATED = (0.0, 0.5, 0.8, 0.95, 1.0)
+_REPEATED = (0.5, 0.8, 0.95, 1.0)
 """Shares of the draws that repeat a verdict, at which `_RIGHT` is known."""
-_RIGHT = (0.2, 0.4, 0.6, 0.75, 0.9)
-"""How often verdicts that so many draws repeat were right. Rounded from 40 working cases (seed
-901): of those that all draws repeat, 21 of 25."""
+_RIGHT = {
+    'no_gap': (0.6, 0.75, 0.8, 0.93),
+    'explained': (0.4, 0.7, 0.7, 0.91),
+    'partly': (0.1, 0.1, 0.6, 0.8),
+    'inseparable': (0.4, 0.4, 0.4, 0.8),
+    'unknown': (0.65, 0.65, 0.65, 0.75),
+}
+"""How often verdicts that so many draws repeat were right, by status."""
 _POSE = {'force', 'cross_force', 'alpha_rad', 'beta_rad'}
 """Dimensions that only change with the pose."""
 _DRAWS = 200  # Draws of blocks. Chosen: the 5 % quantile has 10 draws below it
@@ -76,6 +81,7 @@ class Verdict:
     effects: tuple[str, ...]  # Effects that are named for certain
     groups: tuple[tuple[str, ...], ...]  # Sets of inseparable effects, one of which acts
     probability: float  # How often such a verdict is right
+    repeated: float  # Share of draws of the blocks that give the same verdict
     # Sets of effects by falling probability, which sums to 1
     hypotheses: tuple[WeightedHypothesis, ...]
     best: frozenset[str]  # The set whose closing the report states
@@ -346,6 +352,7 @@ def decide(
         effects=tuple(sorted(answer.effects)),
         groups=tuple(sorted(tuple(sorted(g)) for g in answer.groups)),
         probability=probability,
+        repeated=_support(answer, votes),
         hypotheses=hypotheses,
         best=best,
         material_mps2=evidence.material_mps2,
@@ -389,7 +396,7 @@ def _probabilities(
 ) -> tuple[float, tuple[WeightedHypothesis, ...]]:
     """Return the probability of the answer, and of all sets, none above the answer's."""
     named, agreed = set(_sets(answer)), _support(answer, votes)
-    probability = float(np.interp(agreed, _REPEATED, _RIGHT))
+    probability = float(np.interp(agreed, _REPEATED, _RIGHT[answer.status]))
     weights = {
         e: min(share / (1 - agreed) * (1 - probability), probability)
         for e, share in votes.items()

@@ -93,6 +93,19 @@ def test_effects_of_the_noise_are_named(option, effect):
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [effect])
 
 
+def test_a_limit_that_one_axis_never_reaches_is_saturation():
+    """Within half a radian of its start, x moves by 0.1 g below its limit, and y stays far away."""
+    script = trajectories.Script(np.pi / 2, 0.0)
+    script.rest(3.0)
+    for to in (0.5, -0.4, 0.3, -0.5, 0.4, 0.0) * 3:
+        script.run('beta', to, 0.5)
+        script.rest(1.0)
+    motion = Motion(script.now_s, *script.joints())
+    recording = simulated(unit(), 'saturation:limit_g=0.97,knee_g=0.01', motion=motion)
+    verdict = as_json(diagnose([recording], unit()))['verdict']
+    assert (verdict['status'], verdict['effects']) == ('explained', ['saturation'])
+
+
 def test_coarse_codes_of_one_axis_are_no_other_effect():
     """Steps of 20 mg are far above the noise: each rest has an error of its own."""
     report = diagnosed('quantisation:axis_lost_bits.y=8')[1]

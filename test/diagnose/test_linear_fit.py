@@ -113,7 +113,7 @@ def test_the_loss_is_half_the_squared_distance():
     residual_v, columns = problem()
     fit = fitted(residual_v, columns)
     std = np.sqrt(fit.covariance[0, 0])
-    assert fit.loss(np.array([fit.values[0] + 2 * std])) == pytest.approx(2.0, rel=1e-6)
+    assert fit.loss(np.array([0]), fit.values[:1] + 2 * std) == pytest.approx(2.0, rel=1e-6)
 
 
 HELD = {
