@@ -366,7 +366,9 @@ class LinearisedHypothesis:
             drifts=(*drifts, *drifts_among(self.sensor.effects)),
         )
 
-    def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
+    def departures(
+        self, fit: LinearFit, full_fit: LinearFit | None = None, lasting: bool = False
+    ) -> np.ndarray:
         """
         Return the departures from the prior mean after a fit, (k,).
 
@@ -374,10 +376,11 @@ class LinearisedHypothesis:
         mean is no better guess. Beside it, each nuisance parameter does so if only the blocks that
         are not fitted determine it: a drift may leave the zero-g open. A shape changes by a factor
         of two at most. In a fit to some blocks, zero-g, scale factor, filter and latency stay
-        within the tolerance of a healthy unit.
+        within the tolerance of a healthy unit. Where the blocks are `lasting` parts, sizes that
+        only the others determine keep their values, too.
         """
         j = len(self.values)
-        values = self._effect_values(fit, full_fit)
+        values = self._effect_values(fit, full_fit, lasting)
         kept = np.flatnonzero(values != self._fitted_values(fit))
         targets = (values - self.prior_mean[:j])[kept]
         departures = fit.given(kept, targets)
@@ -397,7 +400,9 @@ class LinearisedHypothesis:
         j = len(self.values)
         return self.prior_mean[:j] + fit.values[:j]
 
-    def _effect_values(self, fit: LinearFit, full_fit: LinearFit | None) -> np.ndarray:
+    def _effect_values(
+        self, fit: LinearFit, full_fit: LinearFit | None, lasting: bool
+    ) -> np.ndarray:
         """Return the values of the effects, (j,), of which some are kept or bounded."""
         j = len(self.values)
         names = self.names[:j]
@@ -408,7 +413,7 @@ class LinearisedHypothesis:
         is_shape = np.array([parameter_of(name).role is Role.SHAPE for name in names], bool)
         is_limit = np.array([bool(effect_named(name.effect).limits) for name in names], bool)
         is_size = np.array([parameter_of(name).is_size for name in names], bool)
-        keeps = undetermined & (is_limit | ~is_size)
+        keeps = undetermined & (is_limit | ~is_size | lasting)
         values = np.where(keeps, self.values, self._fitted_values(fit))
         low, high = np.sort([self.values / 2, self.values * 2], axis=0)
         return np.where(is_shape, np.clip(values, low, high), values)

@@ -64,6 +64,7 @@ class HeldOutFits:
     model: LinearModel
     # Effects by which the zero-g may drift more than that of a healthy unit
     drifts: tuple[str, ...] = ()
+    run_blocks: int = _RUN_BLOCKS  # Neighbouring blocks that are held out together
     # Figures beside errors of form, as far as they were asked for, by the effects that have them
     beside_errors: dict[frozenset[str], HeldOut] = field(default_factory=dict)
 
@@ -126,10 +127,11 @@ class HeldOutFits:
         """Return the fits to all blocks but one part of them, which is held out."""
         out = []
         for part in range(FOLDS):
-            held_out = (np.arange(BLOCKS) // _RUN_BLOCKS) % FOLDS == part
+            held_out = (np.arange(BLOCKS) // self.run_blocks) % FOLDS == part
             fitted = np.convolve(held_out, np.ones(3), 'same') == 0
             fit = self.linearised.fit(fitted, self.drifts)
-            out.append(Fold(held_out, fitted, fit, self.linearised.departures(fit, self.full)))
+            departures = self.linearised.departures(fit, self.full, self.run_blocks > _RUN_BLOCKS)
+            out.append(Fold(held_out, fitted, fit, departures))
         return out
 
     @cached_property
@@ -155,6 +157,11 @@ class HeldOutFits:
                     left_v[samples] = values[samples] @ v
             every.append(left_v)
         return every
+
+    @cached_property
+    def by_quarter(self) -> np.ndarray:
+        """Log likelihood by block, (blocks,), where whole quarters of the time are held out."""
+        return replace(self, run_blocks=BLOCKS // FOLDS).figures.log_likelihood
 
     def squares_between(self, other: HeldOutFits) -> np.ndarray:
         """Squares by which predictions differ, mean over axes, by block, (m/s²)², (blocks,)."""

@@ -49,10 +49,9 @@ def increments_p(
     """
     Return how probable the increments of a residual are if they are those of a random drift.
 
-    The means are those over the time from which the drift exceeds the noise: twice that of the
-    smallest Allan deviation. A drift has no jump, increments as large at rest as in motion (test
-    of Mann and Whitney 1947), and no line. Jumps between levels, what a motor does, and slow
-    oscillations have not.
+    A drift has no jump in means over the time from which it exceeds the noise, that of the
+    smallest Allan deviation, or longer; increments as large at rest as in motion (test of Mann and
+    Whitney 1947); and no line. Jumps, what a motor does, and slow oscillations have not.
     """
     longest = int(used.sum()) // _FEWEST_MEANS
     lengths = np.unique(
@@ -77,14 +76,20 @@ def increments_p(
 
     by_length = [increments(length) for length in lengths.tolist()]
     quietest = min(range(len(lengths)), key=lambda i: np.mean(by_length[i].values ** 2))
-    steps = increments(min(2 * lengths[quietest], longest)).values
-    if len(steps) < _FEWEST_STEPS or not np.ptp(steps):
-        return 1.0
-    # The longest means that are often at rest show the drift best.
-    often = [each for each in by_length if each.fewest >= _FEWEST_STEPS]
-    alike = often[-1].alike_p if often else 1.0
+    steps = [each.values for each in by_length[quietest:]]
+    jumps = [_jump_p(s) for s in steps if len(s) >= _FEWEST_STEPS and np.ptp(s)]
+    # The longest means that are often at rest show the drift best, if it exceeds the noise there.
+    # Where it does not, what seems to be a drift may be what a motor does.
+    often = [i for i, each in enumerate(by_length) if each.fewest >= _FEWEST_STEPS]
+    shown = often[-1:] if often and often[-1] >= quietest else often
+    alike = [by_length[i].alike_p for i in shown]
     line = _line_p(values, used, lengths[0])
-    return float(min(1.0, 3 * min(line, _jump_p(steps), alike)))
+    return _smallest_p([line, _smallest_p(jumps), _smallest_p(alike)])
+
+
+def _smallest_p(tests: list[float]) -> float:
+    """Return how probable the smallest of some probabilities is; 1 of none."""
+    return min([1.0, *(len(tests) * p for p in tests)])
 
 
 def between_rests_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
@@ -117,10 +122,9 @@ def _jump_p(steps: np.ndarray) -> float:
     two of them, which are order statistics of a beta distribution.
     """
     sizes = np.abs(steps)
-    around = np.lib.stride_tricks.sliding_window_view(
-        np.pad(sizes, _AROUND, mode='reflect'), 2 * _AROUND + 1
-    )
-    largest = np.max(sizes / np.median(np.delete(around, _AROUND, axis=1), axis=1))
+    around = np.lib.stride_tricks.sliding_window_view(sizes, 2 * _AROUND + 1)
+    median_size = np.median(np.delete(around, _AROUND, axis=1), axis=1)
+    largest = np.max(sizes[_AROUND:-_AROUND] / median_size)
     part = scipy.stats.beta.ppf(_PARTS, _AROUND + 0.5, _AROUND + 0.5)
     median = scipy.stats.norm.ppf((1 + part) / 2)
     return float(min(1.0, len(steps) * np.mean(2 * scipy.stats.norm.sf(largest * median))))

@@ -253,8 +253,8 @@ def _answer(
         certain |= named
     remaining = powers.remaining if best else powers.repeats
     is_partly = remaining > SHARE_OF_FORM * (powers.explained + remaining)
-    if groups and is_partly and not certain:
-        # Nothing is named for certain, and none of the rivals explains what repeats.
+    if groups and not detected and unexplained > SHARE_OF_FORM * (powers.explained + unexplained):
+        # None of the rivals explains what repeats: the set only imitates it.
         return _Answer('unknown')
     if groups:
         return _Answer('inseparable', certain, groups)

@@ -37,6 +37,9 @@ _FORM_AT_REST = SHARE_OF_FORM**2
 be an error of its form."""
 _REST_ERRORS = 2.0
 """The same in standard errors: one set in 40 exceeds it by chance."""
+_LASTING_SHARE = 0.5
+"""Share of its log likelihood that a set must gain in quarters that are held out as a whole.
+Chosen: a set names most of a gap."""
 _NATS = 3.0  # Held-out log likelihood that a further effect must gain: a ratio of 20
 _DRIFT_LIMIT = 5.0
 """Expected mean square of a random walk about its mean, divided by the one in a recording, that
@@ -176,9 +179,15 @@ class Evidence:
         """
         Determine whether a set cannot be, however much it explains.
 
-        The rests of the same recording contradict it, or a size is at its bound.
+        The rests of the same recording contradict it, a size is at its bound, or what it gains
+        does not last: from quarter to quarter it gains less than half of that between blocks.
         """
-        if not effects or effects not in self.again:
+        if not effects:
+            return False
+        lasting = self.value(self._nats_by_quarter(effects))
+        if lasting < _LASTING_SHARE * self.value(self.nats(effects, NOTHING)):
+            return True
+        if effects not in self.again:
             return False
         again = self.again[effects]
         more = again.more_at_rest
@@ -257,6 +266,11 @@ class Evidence:
         return self.total(gained)
 
     @_once
+    def _nats_by_quarter(self, effects: frozenset[str]) -> ByDraw:
+        """Return by how much a set makes quarters more probable that were held out as a whole."""
+        return self.total(self._fits(effects).by_quarter - self._fits(NOTHING).by_quarter)
+
+    @_once
     def drift_nats(self, effects: frozenset[str], drift: str, healthy: frozenset[str]) -> ByDraw:
         """
         Return by how much a set and a drift are likelier than a set in healthy noise.
@@ -275,21 +289,10 @@ class Evidence:
         # A weak effect that all blocks do not show is not looked for in draws of them.
         if self.number and others not in self._fits(effects).beside_errors:
             return False
-        gained = self.figure(self._nats_beside_form(effects, others))
-        lost = self.value(self._lost_beside_form(effects, others))
+        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
+        gained = self.figure(self.total(more.log_likelihood - less.log_likelihood))
+        lost = self.value(self.mean(less.squares - more.squares))
         return gained.predicts and lost > self.material_mps2**2
-
-    @_once
-    def _nats_beside_form(self, effects: frozenset[str], others: frozenset[str]) -> ByDraw:
-        """Return by how much a set is likelier than others with errors of form."""
-        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
-        return self.total(more.log_likelihood - less.log_likelihood)
-
-    @_once
-    def _lost_beside_form(self, effects: frozenset[str], others: frozenset[str]) -> ByDraw:
-        """Return what others with errors of form explain less."""
-        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
-        return self.mean(less.squares - more.squares)
 
     def _fits(self, effects: frozenset[str]) -> HeldOutFits:
         """Return the fits of a set in the present noise."""

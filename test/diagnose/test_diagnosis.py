@@ -94,7 +94,7 @@ def test_effects_of_the_noise_are_named(option, effect):
 
 
 def test_a_limit_that_one_axis_never_reaches_is_saturation():
-    """Within half a radian of its start, x moves by 0.1 g below its limit, and y stays far away."""
+    """Within half a radian of its start, x moves about its limit, and y stays far away."""
     script = trajectories.Script(np.pi / 2, 0.0)
     script.rest(3.0)
     for to in (0.5, -0.4, 0.3, -0.5, 0.4, 0.0) * 3:

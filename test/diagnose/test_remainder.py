@@ -84,6 +84,16 @@ def test_what_drifts_in_motion_alone_is_no_drift():
     assert increments_p(noise + moved, np.ones(COUNT, bool), RATE_HZ, RESTING) < 0.001
 
 
+def test_what_a_motor_does_is_no_drift_that_hides_in_the_noise():
+    """It shakes as fast as it turns, which averages out over seconds."""
+    used = np.ones(COUNT, bool)
+    noise = np.random.default_rng(1).normal(size=COUNT)
+    turns = np.cumsum(2 + np.sin(np.arange(COUNT) / 300)) / RATE_HZ
+    shakes = np.where(RESTING, 0.0, 0.4 * np.sin(2 * np.pi * turns))
+    assert increments_p(noise, used, RATE_HZ, RESTING) > 0.001
+    assert increments_p(noise + shakes, used, RATE_HZ, RESTING) < 0.001
+
+
 def test_too_few_increments_say_nothing():
     assert increments_p(np.arange(10.0), np.ones(10, bool), RATE_HZ, np.zeros(10, bool)) == 1.0
 

@@ -29,6 +29,7 @@ def fits(left, drift_mps2=None, seed=1, nats=480.0, tolerated=0.0):
     healthy = SimpleNamespace(
         figures=figures,
         tolerated=np.full(BLOCKS, tolerated * SAMPLES),
+        by_quarter=figures.log_likelihood,
         beside_form_errors=lambda effects: figures,
     )
     made = {HEALTHY: healthy}
@@ -39,8 +40,10 @@ def fits(left, drift_mps2=None, seed=1, nats=480.0, tolerated=0.0):
 
 def drifting(figures, drift_mps2, nats):
     """Return held-out figures of a set in the noise of a drift that is so much likelier."""
+    likely = figures.log_likelihood + nats / BLOCKS
     return SimpleNamespace(
-        figures=HeldOut(figures.squares, figures.log_likelihood + nats / BLOCKS),
+        figures=HeldOut(figures.squares, likely),
+        by_quarter=likely,
         drift_mps2=drift_mps2,
         squares_between=lambda other: np.full(BLOCKS, 5 * SAMPLES),
     )
@@ -136,6 +139,31 @@ def test_what_repeats_beside_an_effect_is_said():
     assert verdict.remainder.value == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(('left', 'status'), [(0.0, 'inseparable'), (1.5, 'unknown')])
+def test_rivals_that_leave_what_repeats_only_imitate_it(left, status):
+    """Two effects that leave a part of a gap, the second of which may be another one."""
+    other = frozenset({'nonlinearity'})
+    candidates = {
+        NOTHING: fits(9.0 + left),
+        BIAS: fits(5.0 + left),
+        LEVER_ARM: fits(7.0 + left),
+        other: fits(7.0 + left),
+        BIAS | LEVER_ARM: fits(left),
+        BIAS | other: fits(0.001 + left),
+    }
+    assert decided(candidates, left_over=left).status == status
+
+
+@pytest.mark.parametrize(('share', 'status'), [(0.6, 'explained'), (0.4, 'unknown')])
+def test_an_effect_must_gain_in_whole_quarters(share, status):
+    """What imitates a jump between neighbouring blocks does not predict a whole quarter."""
+    candidates = {NOTHING: fits(5.0), BIAS: fits(0.0)}
+    without, with_it = candidates[NOTHING][HEALTHY], candidates[BIAS][HEALTHY]
+    gained = with_it.by_quarter - without.by_quarter
+    with_it.by_quarter = without.by_quarter + share * gained
+    assert decided(candidates).status == status
+
+
 def test_what_repeats_and_no_effect_explains_is_unknown():
     verdict = decided({NOTHING: fits(5.0), BIAS: fits(4.5)}, left_over=4.0)
     assert (verdict.status, verdict.effects) == ('unknown', ())
@@ -224,6 +252,7 @@ def test_beside_a_drift_an_effect_is_needed_only_where_it_surely_predicts():
         if not surely:
             gained[:2] += [200.0, -200.0]
         bias['bias_walk'].figures = before._replace(log_likelihood=before.log_likelihood + gained)
+        bias['bias_walk'].by_quarter = bias['bias_walk'].figures.log_likelihood
         assert decided({NOTHING: nothing, BIAS: bias}).effects == named
 
 

@@ -211,6 +211,17 @@ def test_lever_arm_is_centripetal_and_tangential():
     assert difference_mps2[1000, 1] == pytest.approx(0.1 * growth, rel=1e-6)
 
 
+@pytest.mark.parametrize(('frequency_hz', 'share'), [(0.2, 0.0), (20.0, 1.0)])
+def test_vibration_rectification_follows_the_mean_square_but_no_slow_move(frequency_hz, share):
+    time_s = np.arange(0.0, 20.0, 1e-3)
+    force_mps2 = 0.3 * G * np.sin(2 * np.pi * frequency_hz * time_s)
+    path = ForcePath(time_s, np.outer(force_mps2, [1.0, 0.0, 0.0]))
+    moves = Motion(20.0, force=path, internal_rate_hz=1000.0)
+    shaken = with_effect('vibration_rectification', coefficient_per_g=[0.1, 0.1, 0.1])
+    shift_g = volts(shaken, moves) - volts(nominal('xyz', **CLEAN), moves)
+    assert shift_g[1000:, 0].mean() == pytest.approx(share * 0.1 * 0.3**2 / 2, rel=0.1, abs=1e-5)
+
+
 def test_thermal_lag_makes_the_zero_g_follow_a_slower_temperature():
     """With the slope of the zero-g, a step of temperature arrives by 1 − exp(−t/τ)."""
     step = Motion(300.0, internal_rate_hz=10.0, temperature_c=Steps(25.0, ((100.0, 35.0),), 0.01))

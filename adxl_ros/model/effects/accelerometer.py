@@ -297,7 +297,7 @@ def hysteresis(signals: Signals, p: Parameters) -> None:
     Parameter(
         'coefficient_per_g',
         unit='g/g^2',
-        upper=1.0,
+        upper=10.0,
         scale=0.05,
         source='physics: asymmetry of the element, clipping of fast peaks',
         doc='shift of the zero-g divided by the mean square of the vibration',
@@ -312,6 +312,15 @@ def hysteresis(signals: Signals, p: Parameters) -> None:
         doc='time over which the mean square is taken',
         starts=(0.1, 0.5, 2.5),
     ),
+    Shape(
+        'mean_s',
+        unit='s',
+        lower=0.01,
+        upper=10.0,
+        scale=0.1,
+        source='physics: shorter than a move, longer than a vibration',
+        doc='time over which the mean is taken about which the sensor vibrates',
+    ),
     cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',
     diagnosis=DiagnosisHints(
         revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,), proof=(ProofVariable.TIME,)
@@ -321,18 +330,18 @@ def vibration_rectification(signals: Signals, p: Parameters) -> None:
     """
     Vibration rectification: vibration shifts the zero-g by its mean square.
 
-    Add k times the mean square of the acceleration along the axis about its mean, g.
+    Add k times the mean square of the acceleration along the axis about its mean, g. The mean is
+    taken twice, so that a move that is slow beside its time is no vibration.
     """
-    tau_s = p['tau_s']
     for d, k in enumerate(p['coefficient_per_g']):
         if not k:
             continue
-        sensed = signals.sensed[d]
-        of_mean = signals.memory.setdefault((d, 'mean'), {})
+        vibration = signals.sensed[d]
+        for order in range(2):
+            of_mean = signals.memory.setdefault((d, order), {})
+            vibration = vibration - low_pass(vibration, p['mean_s'], signals.dt_s, of_mean)
         of_square = signals.memory.setdefault((d, 'square'), {})
-        mean = low_pass(sensed, tau_s, signals.dt_s, of_mean)
-        vibration = sensed - mean
-        mean_square = low_pass(vibration * vibration, tau_s, signals.dt_s, of_square)
+        mean_square = low_pass(vibration * vibration, p['tau_s'], signals.dt_s, of_square)
         signals.output[d] = signals.output[d] + k * mean_square
 
 
