@@ -238,14 +238,9 @@ def _by_direction(moves: _Moves, along_g: np.ndarray, slopes: np.ndarray) -> np.
 
     slopes: of the force over each joint, (2, n): play of its gears is an error of its angle.
     """
-    directions = [*(of_joint[0] for of_joint in moves.branches)]
-    directions += [*_branches(along_g, _LOOP_REACH[:1])]
-    functions = []
-    for direction in directions:
-        functions += [direction, direction * along_g]
-    for of_joint, slope in zip(moves.branches, slopes):
-        functions += [*(of_joint * slope)]
-    return np.array(functions)
+    of_force = _branches(along_g, _LOOP_REACH[:1])
+    of_joints = [branches * slope for branches, slope in zip(moves.branches, slopes)]
+    return np.concatenate([of_force, of_force * along_g, *of_joints])
 
 
 def _branches(values: np.ndarray, reaches: Iterable[float]) -> np.ndarray:
