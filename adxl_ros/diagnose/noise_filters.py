@@ -41,7 +41,7 @@ import scipy
 if TYPE_CHECKING:
     from adxl_ros.diagnose.comparison import BaselineComparison
 
-RANDOM_WALKS_G_PER_RTS = (1e-7, 1e-5, 3e-5, 7e-5, 1.5e-4, 4e-4, 1e-3, 3e-3)
+RANDOM_WALKS_G_PER_RTS = (1e-7, 1e-5, 3e-5, 7e-5, 1.5e-4, 4e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 """Grid of densities of a random walk, g/√s, a factor of two to three apart."""
 FLICKERS_G_PER_RTHZ = (6e-5, 1.5e-4, 5e-4, 1.5e-3, 4e-3)
 """Grid of densities of 1/f noise at 1 Hz, g/√Hz, a factor of three apart."""
