@@ -38,8 +38,8 @@ be an error of its form."""
 _REST_ERRORS = 2.0
 """The same in standard errors: one set in 40 exceeds it by chance."""
 _LASTING_SHARE = 0.5
-"""Share of its log likelihood that a set must gain in quarters that are held out as a whole.
-Chosen: a set names most of a gap."""
+"""Share of its log likelihood that a set gains in quarters that are held out as a whole, too, where
+it is not sure to gain. Chosen: a set names most of a gap."""
 _NATS = 3.0  # Held-out log likelihood that a further effect must gain: a ratio of 20
 _DRIFT_LIMIT = 5.0
 """Expected mean square of a random walk about its mean, divided by the one in a recording, that
@@ -180,12 +180,13 @@ class Evidence:
         Determine whether a set cannot be, however much it explains.
 
         The rests of the same recording contradict it, a size is at its bound, or what it gains
-        does not last: from quarter to quarter it gains less than half of that between blocks.
+        does not last: in whole quarters it gains less than half, and perhaps nothing.
         """
         if not effects:
             return False
-        lasting = self.value(self._nats_by_quarter(effects))
-        if lasting < _LASTING_SHARE * self.value(self.nats(effects, NOTHING)):
+        lasting = self.figure(self._nats_by_quarter(effects))
+        gained = self.value(self.nats(effects, NOTHING))
+        if lasting.low <= 0 and lasting.value < _LASTING_SHARE * gained:
             return True
         if effects not in self.again:
             return False
