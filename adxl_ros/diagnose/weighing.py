@@ -38,8 +38,8 @@ be an error of its form."""
 _REST_ERRORS = 2.0
 """The same in standard errors: one set in 40 exceeds it by chance."""
 _LASTING_SHARE = 0.5
-"""Share of its log likelihood that a set gains in quarters that are held out as a whole, too, where
-it is not sure to gain. Chosen: a set names most of a gap."""
+"""Share of its log likelihood that a set gains in quarters that are held out whole, if it is not
+sure to gain at all. Chosen: a set names most of a gap."""
 _NATS = 3.0  # Held-out log likelihood that a further effect must gain: a ratio of 20
 _DRIFT_LIMIT = 5.0
 """Expected mean square of a random walk about its mean, divided by the one in a recording, that

@@ -156,7 +156,8 @@ def test_rivals_that_leave_what_repeats_only_imitate_it(left, status):
 
 @pytest.mark.parametrize(('share', 'status'), [(0.1, 'explained'), (-0.1, 'unknown')])
 def test_an_effect_must_gain_in_whole_quarters(share, status):
-    """What imitates a jump between neighbouring blocks does not predict a whole quarter.
+    """
+    What imitates a jump between neighbouring blocks does not predict a whole quarter.
 
     What shows in one quarter alone, as a filter does where it is shaken, gains less there.
     """
