@@ -49,8 +49,8 @@ _RIGHT = {
     'partly': (0.17, 0.32, 0.70, 0.82),
     'unknown': (0.59, 0.59, 0.59, 0.85),
 }
-"""How often verdicts that so many draws repeat were right, by status. Measured on 320 cases, 200 of
-them real recordings: docs/measurements/verdict_probabilities.txt."""
+"""How often verdicts that so many draws repeat were right, by status. Measured on 320 cases, 200
+of them in real recordings: docs/measurements/verdict_probabilities.txt."""
 _POSE = {'force', 'cross_force', 'alpha_rad', 'beta_rad'}
 """Dimensions that only change with the pose."""
 _DRAWS = 200  # Draws of blocks. Chosen: the 5 % quantile has 10 draws below it
