@@ -263,7 +263,7 @@ REPORT = {
     'verdict.of': 'what they are errors of: sensor, stage, reference; joined by "and", "or"',
     'verdict.data_fault': 'with bad_data its fault, one of those below; else null',
     'verdict.probability': 'how often such verdicts were right in other cases',
-    'verdict.repeated': 'share of draws of the blocks that repeat the verdict',
+    'verdict.repeated': 'share of draws of the blocks that name the same',
     'verdict.surest': 'with `--limit` how often an ideal observer is right, at least and at most',
     'hypotheses': 'sets with probabilities that sum to 1; `[]` is no gap; `["unknown"]`',
     'gap': 'rms of recording minus simulation over samples and axes; null for bad_data',

@@ -349,7 +349,7 @@ def _at_rest(
 
 
 def direction_of_last_move(angle_rad: np.ndarray) -> np.ndarray:
-    """Return the direction of the last move of a joint, −1 or 1, 0 before the first, (n,)."""
+    """Return the direction of the last move of a joint, −1 or 1, and 0 in turns, (n,)."""
     return np.rint(stop(angle_rad, _SMALLEST_TURN_RAD, {}))
 
 

@@ -60,6 +60,7 @@ ShowProgress = Callable[[str, float], None]
 
 _SMALLEST_RANGES = {'temperature_c': 0.5, 'supply_v': 0.02}
 """Range of temperature, °C, and supply, V, below which they do not change. Chosen: noise."""
+_FEWEST_RESTING = 200  # Resting samples that show the noise. Chosen: to a tenth of its power
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,11 @@ def diagnose(
     )
     left_out = _material_left_out(checked, verdict)
     if verdict.status == 'no_gap':
-        verdict = replace(verdict, status=_status_without_gap(model.comparisons, left_out))
+        status = _status_without_gap(model.comparisons, left_out)
+        if status == 'unknown':
+            of_status = rule.probability_of(status, verdict.repeated)
+            verdict = replace(verdict, probability=of_status)
+        verdict = replace(verdict, status=status)
     show_progress('5/5 report', 0.9)
     report = _report(checked, model, search, verdict, detections, floor, evidence, seed)
     observed = surest(model, report.hypotheses[0], verdict.named) if limit else None
@@ -311,14 +316,16 @@ def _vibration_in_motion(comparison: BaselineComparison, left_mps2: np.ndarray) 
     """
     Return the squares of vibration that shows only while joints move, (m/s²)², by block.
 
-    It changes from sample to sample, as no motion of an encoder does, and is no noise of the
-    sensor, which shows at rest, too.
+    It is half the squared change from sample to sample: slow motion hardly counts, nor does noise
+    of the sensor, which shows at rest, too.
     """
-    paired = comparison.used & np.roll(comparison.used, 1)
+    paired = comparison.used.copy()
+    paired[1:] &= comparison.used[:-1]
+    paired[0] = False
     rests = comparison.at_rest & paired
-    if not comparison.joints or not rests.any():
+    if not comparison.joints or rests.sum() < _FEWEST_RESTING:
         return np.zeros(BLOCKS)
-    squares = _mean_squares(left_mps2 - np.roll(left_mps2, 1, axis=0)) / 2
+    squares = _mean_squares(np.diff(left_mps2, axis=0, prepend=left_mps2[:1])) / 2
     moves = paired & ~comparison.at_rest
     return sum_by_block(np.where(moves, squares - squares[rests].mean(), 0.0))
 

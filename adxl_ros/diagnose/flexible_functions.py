@@ -42,8 +42,10 @@ _LAG_S = (0.05, 0.5)
 _RELAXATION_S = (1, 4, 16)
 """Time constants of relaxation after a move, s. Chosen: a factor of four apart."""
 _LOOP_REACH = (0.001, 0.004, 0.016, 0.064)
-"""Reach of loops over an angle, divided by its range. Chosen: a factor of four apart; 0.001 is the
-play of a worm gear, 0.1°, in half a turn. A spline that rings at a stop turns by less."""
+"""Reach of loops, divided by the range, of half a turn at most. Chosen: a factor of four apart;
+0.001 is the play of a worm gear, 0.1°."""
+_SMALLEST_REACH = 1e-3
+"""Smallest reach, rad or g. Chosen: a spline that rings at a stop turns by less."""
 _CREEP_S = (2.0, 10.0, 50.0)  # Time constants of creep, s. Chosen: a factor of five apart
 _THERMAL_LAG_S = (20.0, 100.0, 500.0)
 """Time constants of lags of the temperature, s. Chosen: a factor of five apart."""
@@ -244,9 +246,9 @@ def _by_direction(moves: _Moves, along_g: np.ndarray, slopes: np.ndarray) -> np.
 
 
 def _branches(values: np.ndarray, reaches: Iterable[float]) -> np.ndarray:
-    """Return the branches of loops whose reach is a share of the range of values, (k, n)."""
-    reach = max(float(np.ptp(values)), _SMALLEST_SPREAD)
-    return np.array([stop(values, share * reach, {}) for share in reaches])
+    """Return the branches of loops whose reach is a share of the range, (k, n), rad or g."""
+    span = min(float(np.ptp(values)), np.pi)
+    return np.array([stop(values, max(share * span, _SMALLEST_REACH), {}) for share in reaches])
 
 
 def _since_move(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> np.ndarray:

@@ -161,7 +161,8 @@ class HeldOutFits:
     @cached_property
     def by_quarter(self) -> np.ndarray:
         """Log likelihood by block, (blocks,), where whole quarters of the time are held out."""
-        return replace(self, run_blocks=BLOCKS // FOLDS).figures.log_likelihood
+        quarters = replace(self, run_blocks=BLOCKS // FOLDS, beside_errors={})
+        return quarters.figures.log_likelihood
 
     def squares_between(self, other: HeldOutFits) -> np.ndarray:
         """Squares by which predictions differ, mean over axes, by block, (m/s²)², (blocks,)."""

@@ -100,7 +100,7 @@ def _excess(
         return None
     stated_v2 = noise.analog_std_v(sensor) ** 2
     power_v2 = np.maximum(ratio**2 - 1, 0.0) * stated_v2
-    # A drift has a spectrum of its own, near that of its model.
+    # A tenth of a drift may be an error of its form.
     if power_v2.sum() < SHARE_OF_FORM * (drawn_v**2 - stated_v2).sum():
         return None
     return detection_of(Detector.NOISE_LEVEL, power_v2, sensor, ratio=ratio - 1)

@@ -116,7 +116,7 @@ def between_rests_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> flo
 
 def _jump_p(steps: np.ndarray) -> float:
     """
-    Return how probable the largest increment is by the median of those around, if none is a jump.
+    Return how probable the largest increment with five on each side is, if none is a jump.
 
     A walk may change its power slowly. The median of an even number of Gaussian sizes is between
     two of them, which are order statistics of a beta distribution.

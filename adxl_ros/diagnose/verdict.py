@@ -69,7 +69,7 @@ def normalised(weights: Mapping[tuple[str, ...], float]) -> tuple[WeightedHypoth
     return tuple(
         sorted(
             (WeightedHypothesis(effects, weight / total) for effects, weight in weights.items()),
-            key=lambda h: (-h.probability, h.effects),
+            key=lambda h: (-h.probability, len(h.effects), h.effects),
         )
     )
 
@@ -82,7 +82,7 @@ class Verdict:
     effects: tuple[str, ...]  # Effects that are named for certain
     groups: tuple[tuple[str, ...], ...]  # Sets of inseparable effects, one of which acts
     probability: float  # How often such a verdict is right
-    repeated: float  # Share of draws of the blocks that give the same verdict
+    repeated: float  # Share of draws of the blocks that name the same
     # Sets of effects by falling probability, which sums to 1
     hypotheses: tuple[WeightedHypothesis, ...]
     best: frozenset[str]  # The set whose closing the report states
@@ -255,7 +255,8 @@ def _answer(
     remaining = powers.remaining if best else powers.repeats
     is_partly = remaining > SHARE_OF_FORM * (powers.explained + remaining)
     if groups and not detected and unexplained > SHARE_OF_FORM * (powers.explained + unexplained):
-        # None of the rivals explains what repeats: the set only imitates it.
+        # None of the rivals explains what is left: the set only imitates it. What the noise
+        # shows would be lost with it.
         return _Answer('unknown')
     if groups:
         return _Answer('inseparable', certain, groups)
@@ -392,18 +393,24 @@ def _support(answer: _Answer, votes: Mapping[frozenset[str], float]) -> float:
     return sum(votes.get(effects, 0.0) for effects in {*_sets(answer)})
 
 
+def probability_of(status: str, repeated: float) -> float:
+    """Return how often verdicts of a status that so many draws repeat were right."""
+    return float(np.interp(repeated, _REPEATED, _RIGHT[status]))
+
+
 def _probabilities(
     answer: _Answer, votes: Mapping[frozenset[str], float]
 ) -> tuple[float, tuple[WeightedHypothesis, ...]]:
-    """Return the probability of the answer, and of all sets, none above the answer's."""
+    """Return the probability of the answer, and of all sets; no other named one is above it."""
     named, agreed = set(_sets(answer)), _support(answer, votes)
-    probability = float(np.interp(agreed, _REPEATED, _RIGHT[answer.status]))
+    probability = probability_of(answer.status, agreed)
+    highest = probability / len(named)
     weights = {
-        e: min(share / (1 - agreed) * (1 - probability), probability)
+        e: min(share / (1 - agreed) * (1 - probability), highest)
         for e, share in votes.items()
         if e not in named
     }
-    weights |= {effects: probability / len(named) for effects in named}
+    weights |= dict.fromkeys(named, highest)
     missing = 1.0 - sum(weights.values())
     unnamed = frozenset(() if answer.status == 'unknown' else {UNKNOWN})
     if missing > 1e-12:

@@ -216,7 +216,8 @@ class Evidence:
         """Return the power of the vibration of the stage that a set leaves, (m/s²)²."""
         if effects not in self.again:
             return 0.0
-        return max(self.value(self._vibration(effects)), 0.0)
+        left = max(self.value(self.left(effects)), 0.0)
+        return float(np.clip(self.value(self._vibration(effects)), 0.0, left))
 
     @_once
     def _vibration(self, effects: frozenset[str]) -> ByDraw:
@@ -273,11 +274,7 @@ class Evidence:
 
     @_once
     def drift_nats(self, effects: frozenset[str], drift: str, healthy: frozenset[str]) -> ByDraw:
-        """
-        Return by how much a set and a drift are likelier than a set in healthy noise.
-
-        What the effects of that set may have as errors of form is no drift.
-        """
+        """Return by how much a set and a drift are likelier than a set with errors of form."""
         drifting = self.candidates[effects][drift].figures
         steady = self.candidates[healthy][HEALTHY].beside_form_errors(healthy)
         return self.total(drifting.log_likelihood - steady.log_likelihood)
@@ -340,7 +337,7 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     """
     Return the sets all of whose effects are needed, the most probable first.
 
-    Those that the rests refute are dropped; so is an alternative to the first one, or the first
+    Refuted ones are dropped; so is an alternative to the first one, or the first
     one itself, that as it is printed leaves materially more than the other.
     """
     kept = [

@@ -29,7 +29,7 @@ REPEATED = (0.5, 0.8, 0.95, 1.0)
 """Shares of the draws at which the table is known."""
 EDGES = (0.65, 0.9, 0.9999)
 """Shares between them."""
-PRIOR_CASES = 2.0
+PRIOR_CASES = 2.0  # Chosen: a few cases alone decide no share
 
 
 class Case(NamedTuple):

@@ -12,6 +12,7 @@ from adxl_ros.diagnose.report_json import as_json
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Manoeuvre, Need
 from adxl_ros.simulate import trajectories
@@ -175,6 +176,29 @@ def test_an_effect_outside_the_library_is_unknown():
     report = report_of(diagnose([simulated(unit(), change=change)], unit()))
     assert report['verdict']['status'] in ('unknown', 'partly')
     assert 'beta_rad' in report['rest_follows']
+
+
+def test_vibration_while_joints_move_is_of_the_stage():
+    """It is larger than what the lever arm adds, and does not hide it."""
+    added_v = 0.0
+
+    def shaken(columns):
+        nonlocal added_v
+        moves = np.abs(np.gradient(columns['beta_rad'])) > 1e-4
+        added_v = moves[:, None] * np.random.default_rng(5).normal(0, 0.008, (len(moves), 2))
+        return {
+            **columns,
+            'x_v': columns['x_v'] + added_v[:, 0],
+            'y_v': columns['y_v'] + added_v[:, 1],
+        }
+
+    recording = simulated(unit(), 'lever_arm:x_m=0.01,y_m=0.01', change=shaken)
+    diagnosis = diagnose([recording], unit())
+    verdict = diagnosis.report.verdict
+    assert (verdict.status, verdict.effects) == ('partly', ('lever_arm',))
+    vibration_mps2 = G0_MPS2 * np.sqrt(np.mean(added_v**2))
+    assert verdict.vibration_mps2 == pytest.approx(vibration_mps2, rel=0.1)
+    assert 'only while joints move' in as_json(diagnosis)['summary']
 
 
 def test_the_nominal_file_lacks_zero_g_and_scale_factor():
