@@ -46,7 +46,7 @@ _SMALLEST_MOVES = {'alpha': 2e-3, 'beta': 2e-3, 'shift': 1e-6}
 _REST_RATE = 1e-3
 """A joint rests below this rate, rad/s, and the shift below this acceleration, m/s². Chosen: the
 specific force then changes by less than the noise within a second."""
-_SMALLEST_TURN_RAD = 1e-3
+SMALLEST_TURN_RAD = 1e-3
 """Turn of a joint that is a move, rad. Chosen: the force changes by 1 mg, and a spline that rings
 at a stop turns by less."""
 SETTLING_S = 0.3
@@ -350,7 +350,7 @@ def _at_rest(
 
 def direction_of_last_move(angle_rad: np.ndarray) -> np.ndarray:
     """Return the direction of the last move of a joint, −1 or 1, and 0 in turns, (n,)."""
-    return np.rint(stop(angle_rad, _SMALLEST_TURN_RAD, {}))
+    return np.rint(stop(angle_rad, SMALLEST_TURN_RAD, {}))
 
 
 def time_since_move_s(time_s: np.ndarray, rates: Sequence[np.ndarray]) -> np.ndarray:

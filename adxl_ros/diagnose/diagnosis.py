@@ -319,9 +319,7 @@ def _vibration_in_motion(comparison: BaselineComparison, left_mps2: np.ndarray) 
     It is half the squared change from sample to sample: slow motion hardly counts, nor does noise
     of the sensor, which shows at rest, too.
     """
-    paired = comparison.used.copy()
-    paired[1:] &= comparison.used[:-1]
-    paired[0] = False
+    paired = comparison.used & np.append(False, comparison.used[:-1])
     rests = comparison.at_rest & paired
     if not comparison.joints or rests.sum() < _FEWEST_RESTING:
         return np.zeros(BLOCKS)

@@ -44,8 +44,6 @@ _RELAXATION_S = (1, 4, 16)
 _LOOP_REACH = (0.001, 0.004, 0.016, 0.064)
 """Reach of loops, divided by the range, of half a turn at most. Chosen: a factor of four apart;
 0.001 is the play of a worm gear, 0.1°."""
-_SMALLEST_REACH = 1e-3
-"""Smallest reach, rad or g. Chosen: a spline that rings at a stop turns by less."""
 _CREEP_S = (2.0, 10.0, 50.0)  # Time constants of creep, s. Chosen: a factor of five apart
 _THERMAL_LAG_S = (20.0, 100.0, 500.0)
 """Time constants of lags of the temperature, s. Chosen: a factor of five apart."""
@@ -76,25 +74,20 @@ def flexible_bases(
     sensor = comparison.sensor
     force_g = ((baseline_v - sensor.zero_g_v) / sensor.scale_v_per_g).T
     common = _made(_common(comparison), chosen)
-    slopes = np.zeros((2, len(AXES), 0))
-    if comparison.joints:
-        slopes = gravity_slopes(*comparison.joint_values())
     moves = _Moves.of(comparison)
     for axis, along_g in enumerate(force_g):
         factors = {
             Form.TEMPERATURE: along_g,
             Form.SUPPLY: along_g,
-            Form.ALPHA: slopes[0, axis],
-            Form.BETA: slopes[1, axis],
+            Form.ALPHA: moves.slopes[0, axis],
+            Form.BETA: moves.slopes[1, axis],
         }
         functions = dict(common)
         for dimension, factor in factors.items():
             if dimension in common:
                 plain = common[dimension]
                 functions[dimension] = np.concatenate([plain, plain * factor])
-        of_axis = _of_axis(comparison, force_g, axis, baseline_v[:, axis])
-        if moves.moving:
-            of_axis |= _of_moves(comparison, moves, force_g[axis], slopes[:, axis])
+        of_axis = _of_axis(comparison, moves, force_g, axis, baseline_v[:, axis])
         functions |= _made(of_axis, chosen)
         basis = {d: _normalised(values, comparison.used) for d, values in functions.items()}
         yield {d: values for d, values in basis.items() if values.shape[1]}
@@ -135,32 +128,30 @@ def _common(comparison: BaselineComparison) -> _Makers:
 
 
 def _of_axis(
-    comparison: BaselineComparison, force_g: np.ndarray, axis: int, volts: np.ndarray
+    comparison: BaselineComparison,
+    moves: _Moves,
+    force_g: np.ndarray,
+    axis: int,
+    volts: np.ndarray,
 ) -> _Makers:
     """Return what makes functions of the force along and across one axis and of its history."""
     along_g = force_g[axis]
     if np.ptp(along_g) < _SMALLEST_SPREAD:
         return {}
-    return {
+    makers: _Makers = {
         Form.FORCE: partial(_modes, along_g, Form.FORCE),
         Form.CROSS_FORCE: partial(_cross_force, force_g, axis),
         Form.AGEING: lambda: along_g * _modes(comparison.time_s, Form.AGEING),
         Form.CODE: partial(_codes, volts, comparison.sensor.adc_vref_v),
         Form.LAG: partial(_force_history, along_g, comparison.dt_s),
     }
-
-
-def _of_moves(
-    comparison: BaselineComparison, moves: _Moves, along_g: np.ndarray, slopes: np.ndarray
-) -> _Makers:
-    """Return what makes functions of moves of joints, where the force along an axis changes."""
-    if np.ptp(along_g) < _SMALLEST_SPREAD:
-        return {}
-    return {
-        Form.RATE: partial(_by_rate, moves, along_g),
-        Form.DIRECTION: partial(_by_direction, moves, along_g, slopes),
-        Form.SINCE_MOVE: partial(_since_move, moves, along_g, comparison),
-    }
+    if moves.moving:
+        makers |= {
+            Form.RATE: partial(_by_rate, moves, along_g),
+            Form.DIRECTION: partial(_by_direction, moves, along_g, axis),
+            Form.SINCE_MOVE: partial(_since_move, moves, along_g, comparison),
+        }
+    return makers
 
 
 def _cross_force(force_g: np.ndarray, axis: int) -> np.ndarray:
@@ -208,7 +199,8 @@ def _force_history(along_g: np.ndarray, dt_s: float) -> np.ndarray:
 class _Moves:
     """The moves of the joints of a recording."""
 
-    angles_rad: Sequence[np.ndarray]  # Angles of all joints, (n,)
+    angles_rad: list[np.ndarray]  # Angles of all joints, (n,)
+    slopes: np.ndarray  # Derivatives of gravity's direction by both angles, (2, 3, n)
     rates: list[np.ndarray]  # Rates of all joints, rad/s, (n,)
     moving: list[np.ndarray]  # Rates of the joints that move, divided by the largest, (n,)
 
@@ -217,8 +209,12 @@ class _Moves:
         """Return the moves of a recording; no joint moves where it has none."""
         rates = comparison.joint_values(1)
         moving = [rate for rate in rates if np.abs(rate).max() > _SMALLEST_RATE_RAD_S]
+        angles_rad = comparison.joint_values()
+        slopes = np.zeros((2, len(AXES), 0))
+        if angles_rad:
+            slopes = gravity_slopes(*angles_rad)
         relative = [rate / np.abs(rate).max() for rate in moving]
-        return cls(comparison.joint_values(), rates, relative)
+        return cls(angles_rad, slopes, rates, relative)
 
     @cached_property
     def branches(self) -> list[np.ndarray]:
@@ -234,21 +230,25 @@ def _by_rate(moves: _Moves, along_g: np.ndarray) -> np.ndarray:
     return np.array(functions)
 
 
-def _by_direction(moves: _Moves, along_g: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+def _by_direction(moves: _Moves, along_g: np.ndarray, axis: int) -> np.ndarray:
     """
     Return functions of the directions of the last changes of joints and force, (k, n).
 
-    slopes: of the force over each joint, (2, n): play of its gears is an error of its angle.
+    Play of the gears is an error of the angle: it counts by the slope of the force over the joint.
     """
     of_force = _branches(along_g, _LOOP_REACH[:1])
-    of_joints = [branches * slope for branches, slope in zip(moves.branches, slopes)]
+    of_joints = [
+        branches * slope for branches, slope in zip(moves.branches, moves.slopes[:, axis])
+    ]
     return np.concatenate([of_force, of_force * along_g, *of_joints])
 
 
 def _branches(values: np.ndarray, reaches: Iterable[float]) -> np.ndarray:
     """Return the branches of loops whose reach is a share of the range, (k, n), rad or g."""
     span = min(float(np.ptp(values)), np.pi)
-    return np.array([stop(values, max(share * span, _SMALLEST_REACH), {}) for share in reaches])
+    return np.array(
+        [stop(values, max(share * span, beside.SMALLEST_TURN_RAD), {}) for share in reaches]
+    )
 
 
 def _since_move(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> np.ndarray:

@@ -64,7 +64,6 @@ class HeldOutFits:
     model: LinearModel
     # Effects by which the zero-g may drift more than that of a healthy unit
     drifts: tuple[str, ...] = ()
-    run_blocks: int = _RUN_BLOCKS  # Neighbouring blocks that are held out together
     # Figures beside errors of form, as far as they were asked for, by the effects that have them
     beside_errors: dict[frozenset[str], HeldOut] = field(default_factory=dict)
 
@@ -125,12 +124,17 @@ class HeldOutFits:
     @cached_property
     def folds(self) -> list[Fold]:
         """Return the fits to all blocks but one part of them, which is held out."""
+        return self._folds_of(_RUN_BLOCKS)
+
+    def _folds_of(self, run_blocks: int) -> list[Fold]:
+        """Fit to all blocks but a part; so many neighbouring ones are held out together."""
+        lasting = run_blocks > _RUN_BLOCKS
         out = []
         for part in range(FOLDS):
-            held_out = (np.arange(BLOCKS) // self.run_blocks) % FOLDS == part
+            held_out = (np.arange(BLOCKS) // run_blocks) % FOLDS == part
             fitted = np.convolve(held_out, np.ones(3), 'same') == 0
             fit = self.linearised.fit(fitted, self.drifts)
-            departures = self.linearised.departures(fit, self.full, self.run_blocks > _RUN_BLOCKS)
+            departures = self.linearised.departures(fit, self.full, lasting)
             out.append(Fold(held_out, fitted, fit, departures))
         return out
 
@@ -161,8 +165,7 @@ class HeldOutFits:
     @cached_property
     def by_quarter(self) -> np.ndarray:
         """Log likelihood by block, (blocks,), where whole quarters of the time are held out."""
-        quarters = replace(self, run_blocks=BLOCKS // FOLDS, beside_errors={})
-        return quarters.figures.log_likelihood
+        return self._predicted(self._folds_of(BLOCKS // FOLDS)).log_likelihood
 
     def squares_between(self, other: HeldOutFits) -> np.ndarray:
         """Squares by which predictions differ, mean over axes, by block, (m/s²)², (blocks,)."""
@@ -190,10 +193,14 @@ class HeldOutFits:
     @cached_property
     def figures(self) -> HeldOut:
         """Squares and log likelihood of the held-out blocks."""
+        return self._predicted(self.folds)
+
+    def _predicted(self, folds: list[Fold]) -> HeldOut:
+        """Predict the blocks that fits hold out."""
         squares = np.zeros(BLOCKS)
         log_likelihood = np.zeros(BLOCKS)
         linearised = self.linearised
-        for fold in self.folds:
+        for fold in folds:
             held_out = fold.held_out
             for number, columns in enumerate(linearised.columns):
                 channel = linearised.channels[number]

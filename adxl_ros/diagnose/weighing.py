@@ -221,7 +221,7 @@ class Evidence:
 
     @_once
     def _vibration(self, effects: frozenset[str]) -> ByDraw:
-        """Return the same by draw."""
+        """Return its power by draw, which may be more than what is left, or negative by chance."""
         return self.mean(self.again[effects].vibration)
 
     def follows(self, remainder: Remainder, dimensions: Collection[str]) -> bool:
@@ -287,10 +287,21 @@ class Evidence:
         # A weak effect that all blocks do not show is not looked for in draws of them.
         if self.number and others not in self._fits(effects).beside_errors:
             return False
-        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
-        gained = self.figure(self.total(more.log_likelihood - less.log_likelihood))
-        lost = self.value(self.mean(less.squares - more.squares))
+        gained = self.figure(self._nats_beside_form(effects, others))
+        lost = self.value(self._lost_beside_form(effects, others))
         return gained.predicts and lost > self.material_mps2**2
+
+    @_once
+    def _nats_beside_form(self, effects: frozenset[str], others: frozenset[str]) -> ByDraw:
+        """Return by how much a set is likelier than others with errors of form."""
+        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
+        return self.total(more.log_likelihood - less.log_likelihood)
+
+    @_once
+    def _lost_beside_form(self, effects: frozenset[str], others: frozenset[str]) -> ByDraw:
+        """Return what others with errors of form explain less."""
+        more, less = (self._fits(e).beside_form_errors(others) for e in (effects, others))
+        return self.mean(less.squares - more.squares)
 
     def _fits(self, effects: frozenset[str]) -> HeldOutFits:
         """Return the fits of a set in the present noise."""
@@ -337,8 +348,8 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     """
     Return the sets all of whose effects are needed, the most probable first.
 
-    Refuted ones are dropped; so is an alternative to the first one, or the first
-    one itself, that as it is printed leaves materially more than the other.
+    Refuted ones are dropped; so is an alternative to the first one, or the first one itself, that
+    as it is printed leaves materially more than the other.
     """
     kept = [
         effects
