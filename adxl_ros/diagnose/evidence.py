@@ -30,6 +30,8 @@ and blocks of a few seconds in a short recording."""
 _ITERATIONS = 3
 """Iterations over coefficients and noise. Chosen: the filters no longer change then."""
 _SMALLEST_SQUARES_V2 = 1e-300  # Smallest sum of squares, V², whose logarithm is taken: above zero
+_SMALLEST_VARIANCE_V2 = 1e-14
+"""Smallest variance of the noise, V²; a log may have none. Chosen: 0.1 µV, below any ADC."""
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
 UNDETERMINED_SHARE = 0.5
@@ -191,8 +193,9 @@ def fit_columns(
     filters = [int(np.argmax(channel.log_priors)) for channel in selected]
     if start is not None:
         filters = list(start.filter_indices)
-    variance_v2 = np.array(
-        [channel.grams[f, 0, 0] / channel.count for channel, f in zip(selected, filters)]
+    variance_v2 = np.maximum(
+        [channel.grams[f, 0, 0] / channel.count for channel, f in zip(selected, filters)],
+        _SMALLEST_VARIANCE_V2,
     )
     prior_precision = prior_std[ids] ** -2.0
     for _ in range(_ITERATIONS):
@@ -201,7 +204,7 @@ def fit_columns(
             squares_v2 = channel.squares_v2(posterior.mean)
             log_likelihood = -channel.count / 2 * np.log(squares_v2) + channel.log_scales
             filters[i] = int(np.argmax(log_likelihood + channel.log_priors))
-            variance_v2[i] = squares_v2[filters[i]] / channel.count
+            variance_v2[i] = max(squares_v2[filters[i]] / channel.count, _SMALLEST_VARIANCE_V2)
     log_evidence = posterior.log_occam_factor(prior_precision)
     for channel, chosen_filter, variance in zip(selected, filters, variance_v2):
         log_evidence += channel.log_likelihood(chosen_filter, variance)

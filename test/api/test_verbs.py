@@ -255,4 +255,5 @@ def test_a_log_without_noise_has_its_cause() -> None:
     log = adxl.from_arrays(time_s=time_s, **{name: 1.01 * f for name, f in force.items()})
     gap = adxl.diagnose(log, 'any_imu', sim=sim)
     assert gap.verdict == 'explained'
+    assert [effect.name for effect in gap.effects] == ['scale_factor']
     assert 'nan' not in str(gap).split()
